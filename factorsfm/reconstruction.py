@@ -1,0 +1,143 @@
+"""The result of a reconstruction: camera, poses, points with their tracks, prior affines, statuses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+
+class FrameStatus(StrEnum):
+    """What became of a frame; the sentence with the numbers is `FrameResult.message`."""
+
+    REGISTERED = "registered"
+    STATIC = "static"  # registered; the camera does not move measurably against the first frame
+    TOO_FEW_TRACKS = "too_few_tracks"
+    TOO_FEW_INLIERS = "too_few_inliers"
+    BLANK = "blank"  # black, white or blurred: no texture to track
+    WAITING = "waiting"  # not yet initialised
+
+
+class ShotKind(StrEnum):
+    """What the motion of the shot allows one to recover."""
+
+    GENERAL = "general"  # rotation and translation from geometry
+    ROTATION = "rotation"  # pure rotation: translation is not observable from geometry
+    STATIC = "static"  # the camera does not move
+
+
+@dataclass(frozen=True, slots=True)
+class PriorFit:
+    """Scale and shift of one image's depth prior: ``scale / z + shift`` predicts the map's inverse depth.
+
+    Attributes:
+        scale, shift: in units of the prior's inverse depth (scale times the world unit).
+        scale_std, shift_std: standard deviations from the factor graph.
+        sigma: robust standard deviation of the residuals, in the prior's inverse depth.
+    """
+
+    scale: float
+    shift: float
+    scale_std: float
+    shift_std: float
+    sigma: float
+
+
+@dataclass(slots=True)
+class FrameResult:
+    """One frame of the source.
+
+    Attributes:
+        index: position in the source, counted from 0 before any range or step is applied.
+        name: file name or the zero-padded index.
+        timestamp: seconds, where the container has it.
+        status, message: what became of it, and the same in words with numbers.
+        cam_from_world: pose, or None where the frame is not registered.
+        keyframe: whether it is a variable of the incremental graph.
+        observations, inliers: tracked points in the frame, and those that the final model explains.
+        reprojection_error: median over the inliers (pixels), NaN where not registered.
+        prior: fitted scale and shift of the depth prior, None where the frame carries none.
+    """
+
+    index: int
+    name: str
+    timestamp: float | None
+    status: FrameStatus
+    message: str
+    cam_from_world: pycolmap.Rigid3d | None = None
+    keyframe: bool = False
+    observations: int = 0
+    inliers: int = 0
+    reprojection_error: float = float("nan")
+    prior: PriorFit | None = None
+
+    @property
+    def registered(self) -> bool:
+        return self.cam_from_world is not None
+
+
+@dataclass(slots=True)
+class Reconstruction:
+    """Cameras, points and tracks of one shot.
+
+    Attributes:
+        camera: the lens, shared by all frames (COLMAP convention: pixel centres at 0.5).
+        frames: one entry per frame of the source, in order.
+        points: (n, 3) world coordinates.
+        colors: (n, 3) uint8 RGB.
+        track_ids: (n,) identity of each point's track.
+        observation_frame: (m,) position in `frames` of each observation.
+        observation_point: (m,) row in `points` of each observation.
+        observation_xy: (m, 2) pixels, centres at integers (OpenCV).
+        observation_error: (m,) reprojection error, pixels.
+        prior_residual: (m,) residual of the depth prior relative to the predicted inverse depth
+            ``scale / z``, NaN where the observation carries no prior.
+        kind: what the motion allows one to recover.
+        parallax: largest camera displacement over the median point depth (paper, section 4).
+        metric: whether the world unit is the metre (the prior is metric).
+        notes: sentences that a user should read (translation unobservable, focal length guessed, ...).
+        seconds: wall time by stage.
+        options: resolved options as plain data.
+    """
+
+    camera: pycolmap.Camera
+    frames: list[FrameResult]
+    points: NDArray[np.float64]
+    colors: NDArray[np.uint8]
+    track_ids: NDArray[np.int64]
+    observation_frame: NDArray[np.int64]
+    observation_point: NDArray[np.int64]
+    observation_xy: NDArray[np.float64]
+    observation_error: NDArray[np.float64]
+    prior_residual: NDArray[np.float64]
+    kind: ShotKind
+    parallax: float
+    metric: bool = False
+    notes: list[str] = field(default_factory=list)
+    seconds: dict[str, float] = field(default_factory=dict)
+    options: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def registered(self) -> list[FrameResult]:
+        return [frame for frame in self.frames if frame.registered]
+
+    def camera_centers(self) -> NDArray[np.float64]:
+        """(k, 3) centres of the registered cameras, world coordinates."""
+        return np.array(
+            [f.cam_from_world.inverse().translation for f in self.frames if f.cam_from_world is not None]
+        ).reshape(-1, 3)
+
+    def write(self, directory: str | Path) -> None:
+        """Write trajectory, COLMAP model, point cloud, summary and report; all of it or nothing.
+
+        Raises:
+            InputError: the directory cannot be written.
+        """
+        from factorsfm.export.folder import write_folder
+
+        write_folder(self, Path(directory))
