@@ -1,0 +1,1 @@
+"""Metrics, data-set readers and baselines: everything that judges a reconstruction."""

@@ -1,0 +1,286 @@
+"""Errors of trajectories and points against the truth, and the summaries that the paper's tables use.
+
+Poses are arrays: `world_from_cam` rotations (n, 3, 3) and camera centres (n, 3), NaN for unregistered frames.
+Lengths are in the units of the truth (metres), angles in degrees, shares in percent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from factorsfm.errors import InputError
+from factorsfm.evaluation.alignment import Similarity, align, check_trajectories, registered_frames
+
+Array = NDArray[np.float64]
+
+# Ends of the paper's recall curves: metres, metres, degrees.
+ATE_THRESHOLDS = (0.002, 0.02)
+T_RPE_THRESHOLDS = (0.001, 0.005)
+R_RPE_THRESHOLDS = (0.02, 0.1)
+RELATIVE_POSE_THRESHOLDS = (1.0, 5.0, 20.0)  # degrees
+
+_EDGE = 1.05  # largest over smallest true depth in 3x3 pixels, above which a point is left out
+
+
+@dataclass(frozen=True, slots=True)
+class TrajectoryErrors:
+    """Errors after similarity alignment; an unregistered frame, or a pair that holds one, is inf.
+
+    Attributes:
+        ate: (n,) distance of the camera centres.
+        t_rpe: (n - 1,) translation error of the motion from each frame to the next.
+        r_rpe: (n - 1,) rotation error of the same, degrees.
+        alignment: truth from estimate, None where no frame is registered.
+    """
+
+    ate: Array
+    t_rpe: Array
+    r_rpe: Array
+    alignment: Similarity | None
+
+
+def trajectory_errors(
+    rotations: Array,
+    centers: Array,
+    true_rotations: Array,
+    true_centers: Array,
+    scale: float | None = None,
+) -> TrajectoryErrors:
+    """ATE per frame, and T-RPE and R-RPE per pair of consecutive frames.
+
+    Args:
+        rotations, true_rotations: (n, 3, 3) world_from_cam; unregistered frames NaN.
+        centers, true_centers: (n, 3).
+        scale: see `align`.
+
+    Raises:
+        InputError: the arrays do not fit together, or the truth is incomplete.
+    """
+    rotations, centers, true_rotations, true_centers = check_trajectories(
+        rotations, centers, true_rotations, true_centers
+    )
+    n = len(centers)
+    if not registered_frames(centers).any():
+        pairs = max(n - 1, 0)
+        return TrajectoryErrors(np.full(n, np.inf), np.full(pairs, np.inf), np.full(pairs, np.inf), None)
+    alignment = align(rotations, centers, true_rotations, true_centers, scale)
+    centers, rotations = alignment.points(centers), alignment.rotations(rotations)
+    first, second = np.arange(n - 1), np.arange(1, n)
+    turn, move = _relative(rotations, centers, first, second)
+    true_turn, true_move = _relative(true_rotations, true_centers, first, second)
+    return TrajectoryErrors(
+        ate=_inf_where_missing(np.linalg.norm(centers - true_centers, axis=1)),
+        t_rpe=_inf_where_missing(np.linalg.norm(move - true_move, axis=1)),
+        r_rpe=_inf_where_missing(rotation_angle(turn, true_turn)),
+        alignment=alignment,
+    )
+
+
+def rotation_angle(a: Array, b: Array) -> Array:
+    """Angle (...) between rotations (..., 3, 3), degrees; from the chord, exact for small angles."""
+    chord = np.linalg.norm(a - b, axis=(-2, -1)) / np.sqrt(8.0)
+    return np.asarray(np.degrees(2.0 * np.arcsin(np.clip(chord, 0.0, 1.0))))
+
+
+def relative_pose_errors(
+    rotations: Array, centers: Array, true_rotations: Array, true_centers: Array
+) -> Array:
+    """(n (n - 1) / 2,) the larger of rotation and translation-direction error of every pair, degrees.
+
+    Pairs with an unregistered frame have 180. Where the truth does not move between the two frames there is
+    no direction, and the rotation counts alone; where only the estimate does not move, the error is 180.
+
+    Args:
+        rotations, true_rotations: (n, 3, 3) world_from_cam; unregistered frames NaN.
+        centers, true_centers: (n, 3).
+
+    Raises:
+        InputError: the arrays do not fit together, or the truth is incomplete.
+    """
+    rotations, centers, true_rotations, true_centers = check_trajectories(
+        rotations, centers, true_rotations, true_centers
+    )
+    first, second = np.triu_indices(len(centers), k=1)
+    turn, move = _relative(rotations, centers, first, second)
+    true_turn, true_move = _relative(true_rotations, true_centers, first, second)
+    cross = np.linalg.norm(np.cross(move, true_move), axis=1)
+    direction = np.degrees(np.arctan2(cross, np.sum(move * true_move, axis=1)))
+    direction[~move.any(axis=1)] = 180.0
+    direction[~true_move.any(axis=1)] = 0.0
+    errors = np.maximum(rotation_angle(turn, true_turn), direction)
+    return np.where(np.isfinite(errors), errors, 180.0)
+
+
+def auc(errors: ArrayLike, threshold: float) -> float:
+    """Area under the recall curve from 0 to the threshold, percent of the full area.
+
+    The recall curve is a step function, so its exact area is the mean of ``max(0, 1 - error / threshold)``.
+
+    Raises:
+        InputError: no errors, a NaN or negative one, or a threshold that is not positive.
+    """
+    checked = _check_errors(errors)
+    if not threshold > 0:
+        raise InputError(f"the threshold is {threshold}, expected a positive number")
+    return float(100.0 * np.clip(1.0 - checked / threshold, 0.0, None).mean())
+
+
+def recall_curve(errors: ArrayLike, thresholds: ArrayLike) -> Array:
+    """Percent of the errors that do not exceed each threshold (k,).
+
+    Raises:
+        InputError: no errors, or a NaN or negative one.
+    """
+    checked = np.sort(_check_errors(errors))
+    return np.asarray(100.0 * np.searchsorted(checked, thresholds, side="right") / len(checked))
+
+
+def parallax(centers: Array, depths: ArrayLike) -> float:
+    """Largest distance of a camera from the first registered one over the median depth of the points.
+
+    Args:
+        centers: (n, 3); unregistered frames NaN.
+        depths: (m,) depths of the points in the cameras; NaN entries do not count.
+
+    Raises:
+        InputError: no registered frame, or no depth.
+    """
+    known = np.asarray(centers, np.float64)
+    known = known[registered_frames(known)]
+    z = np.asarray(depths, np.float64).ravel()
+    z = z[np.isfinite(z)]
+    if not len(known) or not len(z):
+        raise InputError(f"parallax needs cameras and depths: {len(known)} cameras, {len(z)} depths given")
+    return float(np.linalg.norm(known - known[0], axis=1).max() / np.median(z))
+
+
+@dataclass(frozen=True, slots=True)
+class DepthErrors:
+    """Depths of points beside the true ones; points without a trustworthy truth are NaN in `truth`.
+
+    Attributes:
+        estimate: (m,) estimated depths in the units of the truth.
+        truth: (m,) true depths, NaN where there is none or at a depth edge.
+    """
+
+    estimate: Array
+    truth: Array
+
+    @property
+    def ratio(self) -> Array:
+        """(m,) ``max(d / d*, d* / d)``; inf for points behind the camera, NaN without truth."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = np.maximum(self.estimate / self.truth, self.truth / self.estimate)
+        return np.where(self.estimate > 0, ratio, np.where(np.isnan(self.truth), np.nan, np.inf))
+
+    @property
+    def absolute(self) -> Array:
+        """(m,) ``|d - d*|``, NaN without truth."""
+        return np.asarray(np.abs(self.estimate - self.truth))
+
+    @property
+    def relative(self) -> Array:
+        """(m,) ``|d - d*| / d*``, NaN without truth."""
+        return np.asarray(self.absolute / self.truth)
+
+    @staticmethod
+    def pool(parts: Iterable[DepthErrors]) -> DepthErrors:
+        """The errors of several images or shots as one."""
+        kept = list(parts)
+        none = [np.empty(0)]
+        return DepthErrors(
+            np.concatenate([p.estimate for p in kept] or none),
+            np.concatenate([p.truth for p in kept] or none),
+        )
+
+    def summary(self) -> dict[str, float]:
+        """Percent of the points with truth within each bound, and how many points there are.
+
+        Keys: ``delta<1.05`` to ``delta<1.05^3`` and ``delta<1.25`` to ``delta<1.25^3`` (ratio),
+        ``theta<1cm`` to ``theta<25cm`` (absolute, metres assumed), ``within 5%`` (relative) and ``points``
+        (a count). Without any point the shares are NaN.
+        """
+        has_truth = np.isfinite(self.truth)
+        points = int(has_truth.sum())
+        ratio, absolute = self.ratio[has_truth], self.absolute[has_truth]
+
+        def share(inside: NDArray[np.bool_]) -> float:
+            return float(100.0 * inside.mean()) if points else float("nan")
+
+        result = {
+            f"delta<{base}" + (f"^{power}" if power > 1 else ""): share(ratio < base**power)
+            for base in (1.05, 1.25)
+            for power in (1, 2, 3)
+        }
+        result |= {f"theta<{cm}cm": share(absolute < cm / 100.0) for cm in (1, 2, 5, 10, 25)}
+        result["within 5%"] = share(self.relative[has_truth] < 0.05)
+        result["points"] = points
+        return result
+
+
+def point_depth_errors(
+    xy: Array, depths: Array, truth: NDArray[np.float32], image_size: Sequence[int], scale: float = 1.0
+) -> DepthErrors:
+    """Depths of points seen in one image, beside its true depth map.
+
+    The map is read at the nearest pixel; it may be smaller or larger than the image, both covering the
+    same field of view. Points outside the image, without true depth, or where the true depth of the
+    3 x 3 neighbourhood varies by more than 5 % are NaN in the result.
+
+    Args:
+        xy: (m, 2) pixels, centres at integers.
+        depths: (m,) z in the camera, units of the estimate.
+        truth: (h, w) true z, NaN (or not positive) = none.
+        image_size: width and height of the image of `xy`.
+        scale: truth units per estimate unit (`Similarity.scale`).
+
+    Raises:
+        InputError: the shapes do not fit together.
+    """
+    xy, depths = np.asarray(xy, np.float64), np.asarray(depths, np.float64)
+    if xy.shape != (*depths.shape, 2) or depths.ndim != 1:
+        raise InputError(f"points {xy.shape} and depths {depths.shape} given, expected (m, 2) and (m,)")
+    if truth.ndim != 2 or len(image_size) != 2:
+        raise InputError(f"the depth map has the shape {truth.shape}, expected (h, w)")
+    size = np.array([truth.shape[1], truth.shape[0]])
+    pixels = np.full((len(xy), 2), -1)
+    finite = np.isfinite(xy).all(axis=1)
+    pixels[finite] = np.floor((xy[finite] + 0.5) * size / np.asarray(image_size))
+    inside = ((pixels >= 0) & (pixels < size)).all(axis=1)
+    found = np.full(len(depths), np.nan)
+    x, y = pixels[inside].T
+    found[inside] = _without_edges(truth)[y, x]
+    return DepthErrors(scale * depths, found)
+
+
+def _without_edges(truth: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The depth map with NaN where it has no depth or where its 3 x 3 neighbourhood holds a jump."""
+    valid = np.isfinite(truth) & (truth > 0)
+    kernel = np.ones((3, 3), np.uint8)
+    far = cv2.dilate(np.where(valid, truth, 0.0).astype(np.float32), kernel)
+    near = cv2.erode(np.where(valid, truth, np.inf).astype(np.float32), kernel)
+    return np.where(valid & (far <= _EDGE * near), truth, np.nan).astype(np.float32)
+
+
+def _relative(
+    rotations: Array, centers: Array, first: NDArray[np.int64], second: NDArray[np.int64]
+) -> tuple[Array, Array]:
+    """Rotation and translation of ``T_first^-1 T_second`` for poses ``T = world_from_cam``."""
+    inverse = rotations[first].transpose(0, 2, 1)
+    return inverse @ rotations[second], np.einsum("nij,nj->ni", inverse, centers[second] - centers[first])
+
+
+def _inf_where_missing(errors: Array) -> Array:
+    return np.where(np.isnan(errors), np.inf, errors)
+
+
+def _check_errors(errors: ArrayLike) -> Array:
+    checked = np.asarray(errors, np.float64).ravel()
+    if not checked.size or not (checked >= 0).all():
+        raise InputError("errors must be a non-empty list of numbers that are not negative, without NaN")
+    return checked
