@@ -1,0 +1,8 @@
+"""``python -m factorsfm`` is the command line."""
+
+import sys
+
+from factorsfm.cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())

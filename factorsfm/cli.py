@@ -1,0 +1,207 @@
+"""The command line: reads arguments, calls the Python interface, writes the result folder."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import NoReturn, TextIO
+
+from factorsfm import api, demo
+from factorsfm.camera import read_camera
+from factorsfm.errors import FactorsfmError, ReconstructionError
+from factorsfm.export.folder import check_directory, write_failure, write_folder
+from factorsfm.frames import parse_range
+from factorsfm.options import PRESETS
+from factorsfm.priors.depth import DepthKind
+from factorsfm.reconstruction import Reconstruction
+from factorsfm.summary import program_version, verdict
+
+BAD_INPUT, NOT_RECONSTRUCTED, INTERRUPTED = 2, 3, 130
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command.
+
+    Returns:
+        The exit status: 0 done, 2 bad input, 3 the shot cannot be reconstructed, 130 interrupted.
+    """
+    arguments = _parser().parse_args(argv)
+    level = (logging.WARNING, logging.INFO, logging.DEBUG)[min(arguments.verbose, 2)]
+    logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s")
+    try:
+        with _Progress(sys.stderr, enabled=sys.stderr.isatty() and not arguments.verbose) as progress:
+            if arguments.command == "demo":
+                _demo(arguments, progress)
+            else:
+                _reconstruct(arguments, progress)
+    except ReconstructionError as error:
+        return _complain(f"error: {error}", NOT_RECONSTRUCTED)
+    except FactorsfmError as error:
+        return _complain(f"error: {error}", BAD_INPUT)
+    except KeyboardInterrupt:
+        return _complain("interrupted", INTERRUPTED)
+    return 0
+
+
+def _reconstruct(arguments: argparse.Namespace, progress: _Progress) -> None:
+    check_directory(arguments.output)
+    camera = read_camera(arguments.camera) if arguments.camera else None
+    frames = parse_range(arguments.frames) if arguments.frames else None
+    start = time.perf_counter()
+    try:
+        reconstruction = api.reconstruct(
+            arguments.source,
+            camera=camera,
+            depth=_unless_none(arguments.depth),
+            depth_kind=arguments.depth_kind,
+            masks=_unless_none(arguments.masks),
+            frames=frames,
+            preset=arguments.preset,
+            progress=progress,
+        )
+    except ReconstructionError as error:
+        given = {k: v for k, v in vars(arguments).items() if k not in ("command", "output", "verbose")}
+        seconds = {"total": time.perf_counter() - start}
+        write_failure(arguments.output, str(error), getattr(error, "frames", ()), given, seconds)
+        raise
+    progress("writing", 0, None)
+    write_folder(reconstruction, arguments.output)
+    progress.clear()
+    _report(reconstruction, arguments.output)
+
+
+def _demo(arguments: argparse.Namespace, progress: _Progress) -> None:
+    result = demo.run_demo(arguments.output, progress)
+    progress.clear()
+    _report(result.reconstruction, arguments.output)
+    print(result.comparison())
+
+
+def _report(reconstruction: Reconstruction, output: Path) -> None:
+    print(f"{verdict(reconstruction)}.")
+    for note in reconstruction.notes:
+        print(f"Note: {note}")
+    print(f"Result in {output}; open {output / 'report.html'}")
+
+
+def _unless_none(text: str | None) -> str | None:
+    return None if text == "none" else text
+
+
+def _complain(message: str, status: int) -> int:
+    print(f"factorsfm: {' '.join(message.split())}", file=sys.stderr)
+    return status
+
+
+class _Progress:
+    """One line on the terminal, rewritten; nothing where it is not enabled."""
+
+    _SECONDS_BETWEEN = 0.1
+
+    def __init__(self, stream: TextIO, enabled: bool) -> None:
+        self._stream = stream
+        self._enabled = enabled
+        self._stage = ""
+        self._written = 0.0
+
+    def __call__(self, stage: str, done: int, total: int | None) -> None:
+        now = time.monotonic()
+        if not self._enabled or (stage == self._stage and now < self._written + self._SECONDS_BETWEEN):
+            return
+        self._stage, self._written = stage, now
+        count = f" {done}/{total}" if total is not None else f" {done}" if done else ""
+        self._stream.write(f"\r\x1b[K{stage}{count}")
+        self._stream.flush()
+
+    def clear(self) -> None:
+        if self._stage:
+            self._stage = ""
+            self._stream.write("\r\x1b[K")
+            self._stream.flush()
+
+    def __enter__(self) -> _Progress:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.clear()
+
+
+class _Parser(argparse.ArgumentParser):
+    """Complains in one line, like every other error of the command line."""
+
+    def error(self, message: str) -> NoReturn:
+        sys.exit(_complain(f"error: {message} (see {self.prog} --help)", BAD_INPUT))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog="factorsfm",
+        description="Depth-guided structure from motion for shots with little parallax.",
+        epilog="Exit status: 0 done, 2 bad input, 3 the shot cannot be reconstructed, 130 interrupted.",
+    )
+    parser.add_argument("--version", action="version", version=f"factorsfm {program_version()}")
+    common = _Parser(add_help=False)
+    common.add_argument(
+        "-v", "--verbose", action="count", default=0, help="log what happens; twice: in every detail"
+    )
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    reconstruct = commands.add_parser(
+        "reconstruct",
+        parents=[common],
+        help="recover camera path, lens and points of a shot",
+        description="Recover camera path, lens and sparse points of a shot.",
+    )
+    reconstruct.add_argument("source", metavar="SOURCE", help="a video file, or a folder of images")
+    reconstruct.add_argument(
+        "--output",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="folder of the result: new, empty, or holding an earlier result, which is replaced",
+    )
+    reconstruct.add_argument(
+        "--camera", type=Path, metavar="FILE.json", help="width, height, fx, fy, cx, cy; default: estimated"
+    )
+    reconstruct.add_argument(
+        "--depth",
+        default="tcmonodepth",
+        metavar="MODEL.onnx|NAME|FOLDER|none",
+        help="depth prior: a network, a named model, or a folder of maps (default: %(default)s)",
+    )
+    reconstruct.add_argument(
+        "--depth-kind",
+        choices=[kind.value for kind in DepthKind],
+        help="what the depth prior holds, where it cannot be known",
+    )
+    reconstruct.add_argument(
+        "--masks",
+        metavar="FOLDER|MODEL.onnx|none",
+        help="what moves and is to be ignored: non-zero in the masks (default: none)",
+    )
+    reconstruct.add_argument("--frames", metavar="START:STOP[:STEP]", help="counted from 0, without STOP")
+    reconstruct.add_argument(
+        "--preset", choices=list(PRESETS), default="default", help="default: %(default)s"
+    )
+
+    demo_command = commands.add_parser(
+        "demo",
+        parents=[common],
+        help="reconstruct a rendered shot and compare it with the truth",
+        description="Render a small shot, reconstruct it from its video file, and compare with the truth.",
+    )
+    demo_command.add_argument(
+        "--output",
+        type=Path,
+        default=Path("factorsfm_demo"),
+        metavar="DIR",
+        help="folder of the result (default: %(default)s)",
+    )
+    return parser

@@ -1,0 +1,136 @@
+"""The sparse model as COLMAP's text files, which pycolmap, Gaussian-splat trainers and others read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path, PurePath
+from typing import NamedTuple
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from factorsfm.reconstruction import Reconstruction
+
+_CAMERA_ID = 1
+
+
+class _Observations(NamedTuple):
+    """The observations that are written, sorted by frame; all arrays (k,) but `xy` (k, 2)."""
+
+    frame: NDArray[np.int64]
+    point: NDArray[np.int64]
+    place: NDArray[np.int64]  # position in the image's list of 2-D points
+    xy: NDArray[np.float64]  # pixel centres at 0.5
+    error: NDArray[np.float64]
+
+
+def write_colmap(reconstruction: Reconstruction, folder: str | Path) -> None:
+    """Write ``cameras.txt``, ``images.txt`` and ``points3D.txt``; the folder is made if absent.
+
+    The image id is the frame index + 1, the point id the row in ``reconstruction.points`` + 1. Points seen
+    from fewer than two registered frames are left out. Pixel centres lie at 0.5, as in all of COLMAP.
+    The text format cannot hold a blank in an image name; where there is one, the binary files are
+    written as well (readers prefer them).
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    observations = _observations(reconstruction)
+    camera = reconstruction.camera
+    lens = (_CAMERA_ID, camera.model_name, camera.width, camera.height, *map(_exact, camera.params))
+    _write_lines(folder / "cameras.txt", "CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", [_join(lens)])
+    _write_lines(
+        folder / "images.txt",
+        "IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; next line: POINTS2D[] as (X, Y, POINT3D_ID)",
+        _image_lines(reconstruction, observations),
+    )
+    _write_lines(
+        folder / "points3D.txt",
+        "POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)",
+        _point_lines(reconstruction, observations),
+    )
+
+    names = {frame.index + 1: _image_name(frame.name) for frame in reconstruction.frames}
+    if any(" " in name for name in names.values()):
+        model = pycolmap.Reconstruction(folder)
+        for image_id, image in model.images.items():
+            image.name = names[image_id]
+        model.write_binary(folder)
+
+
+def _observations(reconstruction: Reconstruction) -> _Observations:
+    """Observations in registered frames of points that at least two of them see."""
+    frame, point = reconstruction.observation_frame, reconstruction.observation_point
+    registered = np.array([f.registered for f in reconstruction.frames], bool)
+    views = np.bincount(point[registered[frame]], minlength=len(reconstruction.points))
+    rows = np.flatnonzero(registered[frame] & (views[point] >= 2))
+    rows = rows[np.argsort(frame[rows], kind="stable")]
+    first_of_frame = np.searchsorted(frame[rows], np.arange(len(registered)))
+    return _Observations(
+        frame=frame[rows],
+        point=point[rows],
+        place=np.arange(len(rows)) - first_of_frame[frame[rows]],
+        xy=reconstruction.observation_xy[rows] + 0.5,
+        error=reconstruction.observation_error[rows],
+    )
+
+
+def _image_lines(reconstruction: Reconstruction, observations: _Observations) -> list[str]:
+    points2d = [
+        f"{x:.6f} {y:.6f} {point + 1}"
+        for (x, y), point in zip(observations.xy.tolist(), observations.point.tolist(), strict=True)
+    ]
+    bounds = np.searchsorted(observations.frame, np.arange(len(reconstruction.frames) + 1))
+    lines = []
+    for frame, start, stop in zip(reconstruction.frames, bounds[:-1], bounds[1:], strict=True):
+        if frame.cam_from_world is not None:
+            qx, qy, qz, qw = frame.cam_from_world.rotation.quat
+            pose = map(_exact, (qw, qx, qy, qz, *frame.cam_from_world.translation))
+            lines.append(_join((frame.index + 1, *pose, _CAMERA_ID, _image_name(frame.name))))
+            lines.append(_join(points2d[start:stop]))
+    return lines
+
+
+def _point_lines(reconstruction: Reconstruction, observations: _Observations) -> list[str]:
+    image_ids = np.array([frame.index + 1 for frame in reconstruction.frames], np.int64)
+    order = np.argsort(observations.point, kind="stable")
+    tracks = [
+        f"{image_id} {place}"
+        for image_id, place in zip(
+            image_ids[observations.frame[order]].tolist(), observations.place[order].tolist(), strict=True
+        )
+    ]
+    points, starts = np.unique(observations.point[order], return_index=True)
+    stops = np.append(starts, len(tracks))[1:]
+    errors = _mean_errors(observations, len(reconstruction.points))
+    lines = []
+    for point, start, stop in zip(points, starts, stops, strict=True):
+        xyz = map(_exact, reconstruction.points[point])
+        rgb = reconstruction.colors[point]
+        lines.append(_join((point + 1, *xyz, *rgb, f"{errors[point]:.6g}", *tracks[start:stop])))
+    return lines
+
+
+def _mean_errors(observations: _Observations, count: int) -> NDArray[np.float64]:
+    """(count,) mean reprojection error of each point; -1, COLMAP's "unknown", where there is none."""
+    known = np.isfinite(observations.error)
+    number = np.bincount(observations.point[known], minlength=count)
+    total = np.bincount(observations.point[known], observations.error[known], minlength=count)
+    return np.where(number > 0, total / np.maximum(number, 1), -1.0)
+
+
+def _image_name(name: str) -> str:
+    """Frames of a video are named by a bare number; COLMAP expects the name of an image file."""
+    return name if PurePath(name).suffix else f"{name}.png"
+
+
+def _exact(value: float) -> str:
+    return f"{value:.17g}"
+
+
+def _join(values: Iterable[object]) -> str:
+    return " ".join(map(str, values))
+
+
+def _write_lines(path: Path, columns: str, lines: list[str]) -> None:
+    path.write_text("\n".join([f"# {columns}", *lines, ""]), encoding="utf-8")

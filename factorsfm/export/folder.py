@@ -1,0 +1,120 @@
+"""The result folder: written beside its place and moved there when it is complete."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from factorsfm.errors import InputError
+from factorsfm.export.colmap import write_colmap
+from factorsfm.export.ply import write_ply
+from factorsfm.export.trajectory import write_trajectory
+from factorsfm.reconstruction import FrameResult, Reconstruction
+from factorsfm.report.page import report_html
+from factorsfm.summary import PROGRAM, failure_summary, json_text, summary
+
+# Whatever an earlier result may have left; picture.png is drawn by the demo.
+_ENTRIES = ("trajectory.tum", "colmap", "points.ply", "report.html", "picture.png", "summary.json")
+
+
+def write_folder(reconstruction: Reconstruction, directory: str | Path) -> None:
+    """Write trajectory.tum, colmap/, points.ply, summary.json and report.html; all of them or nothing.
+
+    The files of an earlier result are replaced; other files in such a folder stay.
+
+    Raises:
+        InputError: the directory cannot be written, or holds something else than an earlier result.
+    """
+    with _complete_or_nothing(Path(directory)) as folder:
+        write_trajectory(reconstruction, folder / "trajectory.tum")
+        write_colmap(reconstruction, folder / "colmap")
+        write_ply(reconstruction, folder / "points.ply")
+        (folder / "report.html").write_text(report_html(reconstruction), encoding="utf-8")
+        (folder / "summary.json").write_text(json_text(summary(reconstruction)), encoding="utf-8")
+
+
+def write_failure(
+    directory: str | Path,
+    reason: str,
+    frames: Sequence[FrameResult] = (),
+    options: Mapping[str, Any] | None = None,
+    seconds: Mapping[str, float] | None = None,
+) -> None:
+    """Write a summary.json that says why the shot cannot be reconstructed; an earlier result is removed.
+
+    Raises:
+        InputError: the directory cannot be written, or holds something else than an earlier result.
+    """
+    with _complete_or_nothing(Path(directory)) as folder:
+        content = failure_summary(reason, frames, options or {}, seconds or {})
+        (folder / "summary.json").write_text(json_text(content), encoding="utf-8")
+
+
+def check_directory(directory: str | Path) -> None:
+    """Find out before the long work whether a result can be written here; changes nothing.
+
+    Raises:
+        InputError: the directory cannot be written, or holds something else than an earlier result.
+    """
+    directory = Path(directory)
+    try:
+        if directory.exists() and any(directory.iterdir()) and not _is_earlier_result(directory):
+            raise InputError(
+                f"the output folder {directory} is not empty and holds no earlier factorsfm result; "
+                "choose a new or empty folder"
+            )
+        existing = next(p for p in (directory, *directory.absolute().parents) if p.exists())
+        with tempfile.TemporaryDirectory(prefix=f".{PROGRAM}-", dir=existing):
+            pass
+    except OSError as error:
+        raise _unwritable(directory, error) from error
+
+
+@contextmanager
+def _complete_or_nothing(directory: Path) -> Iterator[Path]:
+    """A folder to write into; its content becomes `directory` when the block ends without an error."""
+    check_directory(directory)
+    existed = directory.exists()
+    try:
+        # Inside a directory that exists, since that may be a mount point or the working directory.
+        place = directory if existed else directory.absolute().parent
+        place.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{PROGRAM}-", dir=place) as temporary:
+            folder = Path(temporary) / "result"  # a plain mkdir honours the umask, mkdtemp does not
+            folder.mkdir()
+            yield folder
+            if existed:
+                _replace_entries(folder, directory)
+            else:
+                folder.rename(directory)
+    except OSError as error:
+        raise _unwritable(directory, error) from error
+
+
+def _replace_entries(new: Path, directory: Path) -> None:
+    """Swap the files one by one; summary.json, which marks a result, goes last."""
+    for name in _ENTRIES:
+        old = directory / name
+        if old.is_dir():
+            shutil.rmtree(old)
+        elif not (new / name).exists():
+            old.unlink(missing_ok=True)
+        if (new / name).exists():
+            (new / name).replace(old)
+
+
+def _is_earlier_result(directory: Path) -> bool:
+    try:
+        content = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(content, dict) and content.get("program") == PROGRAM
+
+
+def _unwritable(directory: Path, error: OSError) -> InputError:
+    return InputError(f"cannot write to the output folder {directory}: {error.strerror or error}")

@@ -1,0 +1,140 @@
+"""A result in numbers: what summary.json holds and the report shows."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import numpy as np
+
+from factorsfm.camera import camera_to_json
+from factorsfm.reconstruction import FrameResult, Reconstruction, ShotKind
+
+PROGRAM = "factorsfm"
+
+
+def program_version() -> str:
+    """Version of the installed package; "unknown" in a checkout that is not installed."""
+    try:
+        return version(PROGRAM)
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def summary(reconstruction: Reconstruction) -> dict[str, Any]:
+    """Everything in numbers; NaN where a value does not exist (`json_text` turns it into null)."""
+    return {
+        "program": PROGRAM,
+        "version": program_version(),
+        "reconstructed": True,
+        "verdict": verdict(reconstruction),
+        "source": reconstruction.options.get("source"),
+        "frames": len(reconstruction.frames),
+        "registered": len(reconstruction.registered),
+        "keyframes": sum(frame.keyframe for frame in reconstruction.frames),
+        "points": len(reconstruction.points),
+        "observations": len(reconstruction.observation_point),
+        "parallax": reconstruction.parallax,
+        "kind": reconstruction.kind,
+        "metric": reconstruction.metric,
+        "reprojection_error": median_reprojection_error(reconstruction),
+        "focal_length": reconstruction.camera.mean_focal_length(),
+        "camera": camera_to_json(reconstruction.camera),
+        "seconds": with_total(reconstruction.seconds),
+        "notes": reconstruction.notes,
+        "statuses": [_frame_json(frame) for frame in reconstruction.frames],
+        "options": reconstruction.options,
+    }
+
+
+def failure_summary(
+    reason: str, frames: Sequence[FrameResult], options: Mapping[str, Any], seconds: Mapping[str, float]
+) -> dict[str, Any]:
+    """The summary of a shot that cannot be reconstructed."""
+    return {
+        "program": PROGRAM,
+        "version": program_version(),
+        "reconstructed": False,
+        "reason": reason,
+        "source": options.get("source"),
+        "frames": len(frames),
+        "registered": 0,
+        "seconds": with_total(seconds),
+        "statuses": [_frame_json(frame) for frame in frames],
+        "options": options,
+    }
+
+
+def verdict(reconstruction: Reconstruction) -> str:
+    """What has been recovered, in one sentence for the user."""
+    frames, registered = len(reconstruction.frames), len(reconstruction.registered)
+    share = f"all {frames} frames" if registered == frames else f"{registered} of {frames} frames"
+    sentence = f"{share} registered, {len(reconstruction.points):,} points"
+    error = median_reprojection_error(reconstruction)
+    if math.isfinite(error):
+        sentence += f", median reprojection error {error:.2f} px"
+    if reconstruction.kind is ShotKind.GENERAL:
+        return f"{sentence}, parallax {reconstruction.parallax:.3f}"
+    motion = "pure rotation" if reconstruction.kind is ShotKind.ROTATION else "static camera"
+    return f"{sentence}; {motion}, no parallax"
+
+
+def median_reprojection_error(reconstruction: Reconstruction) -> float:
+    """Median over all observations, pixels; NaN where there is none."""
+    errors = reconstruction.observation_error
+    errors = errors[np.isfinite(errors)]
+    return float(np.median(errors)) if len(errors) else float("nan")
+
+
+def with_total(seconds: Mapping[str, float]) -> dict[str, float]:
+    """The stages, and their sum where no total has been measured."""
+    return {**seconds, "total": seconds.get("total", sum(seconds.values()))}
+
+
+def json_text(value: Any, indent: int | None = 1) -> str:
+    """Valid JSON: NaN and infinity become null, numpy values and paths plain ones."""
+    separators = (",", ":") if indent is None else None
+    return json.dumps(
+        _plain(value), indent=indent, separators=separators, allow_nan=False, ensure_ascii=False
+    )
+
+
+def _frame_json(frame: FrameResult) -> dict[str, Any]:
+    prior = frame.prior
+    return {
+        "index": frame.index,
+        "name": frame.name,
+        "timestamp": frame.timestamp,
+        "status": frame.status,
+        "message": frame.message,
+        "registered": frame.registered,
+        "keyframe": frame.keyframe,
+        "observations": frame.observations,
+        "inliers": frame.inliers,
+        "reprojection_error": frame.reprojection_error,
+        "prior": prior
+        and {
+            "scale": prior.scale,
+            "scale_std": prior.scale_std,
+            "shift": prior.shift,
+            "shift_std": prior.shift_std,
+            "sigma": prior.sigma,
+        },
+    }
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.ndarray | np.generic):
+        return _plain(value.tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    return str(value)
