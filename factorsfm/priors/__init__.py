@@ -1,0 +1,20 @@
+"""What networks, or files in their place, say of a single image: depth and masks."""
+
+from factorsfm.priors.depth import DepthFolder, DepthKind, DepthMap, DepthModel, DepthPrior, open_depth
+from factorsfm.priors.masks import MaskFolder, MaskModel, MaskPrior, open_masks
+from factorsfm.priors.networks import NETWORK_SPECS, NetworkSpec
+
+__all__ = [
+    "NETWORK_SPECS",
+    "DepthFolder",
+    "DepthKind",
+    "DepthMap",
+    "DepthModel",
+    "DepthPrior",
+    "MaskFolder",
+    "MaskModel",
+    "MaskPrior",
+    "NetworkSpec",
+    "open_depth",
+    "open_masks",
+]

@@ -1,0 +1,170 @@
+"""Mask priors: which pixels of an image to ignore, because what they show moves."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from factorsfm.errors import InputError, ModelError
+from factorsfm.frames import Frame
+from factorsfm.priors.depth import FrameFiles, check_aspect, image_stem
+from factorsfm.priors.models import find_model
+from factorsfm.priors.networks import Network, NetworkSpec
+
+# What moves in PASCAL VOC: aeroplane, bicycle, boat, bus, car, cat, dog, horse, motorbike, person, train.
+MOVABLE_LABELS = frozenset({1, 2, 4, 6, 7, 8, 12, 13, 14, 15, 19})
+
+# Share of the image width by which masks are grown: a mask's outline is never exact, and a track's window
+# reaches across it.
+DEFAULT_MARGIN = 0.006
+
+
+@runtime_checkable
+class MaskPrior(Protocol):
+    """Anything that says which pixels of a frame to ignore."""
+
+    def __call__(self, frame: Frame) -> NDArray[np.bool_] | None:
+        """(h, w) of the frame's image, True = ignore; None where there is no mask."""
+
+
+class MaskFolder:
+    """A folder of masks, one file a frame; frames may lack one.
+
+    Masks are .png, .bmp or .tif images of any size with the aspect ratio of their frame; non-zero = ignore.
+    Files named as COLMAP wants them (the full image name and ".png", as in "a.jpg.png") follow COLMAP: zero =
+    ignore. A mask belongs to the frame whose name it bears, else to the frame with its number, as in
+    `DepthFolder`.
+
+    Args:
+        path: the folder.
+        margin: share of the image width by which the ignored area grows.
+
+    Attributes:
+        matched: how many of the frames asked for had a mask.
+
+    Raises:
+        InputError: the folder is missing or holds no mask, or the margin is negative.
+    """
+
+    def __init__(self, path: str | Path, margin: float = DEFAULT_MARGIN) -> None:
+        self._files = FrameFiles(Path(path), (".png", ".bmp", ".tif", ".tiff"), "masks")
+        self._margin = _checked_margin(margin)
+        self.name = Path(path).name
+        self.matched = 0
+
+    def __call__(self, frame: Frame) -> NDArray[np.bool_] | None:
+        """The mask of a frame, None where the folder has none for it.
+
+        Raises:
+            InputError: the mask cannot be read or has another aspect ratio than the frame.
+        """
+        path = self._files.find(frame)
+        if path is None:
+            return None
+        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        if image is None:
+            raise InputError(f"the mask {path} cannot be read")
+        check_aspect(image, frame, path)
+        channels = image.reshape(*image.shape[:2], -1)[..., :3]  # a fourth one would be alpha
+        marked = (channels != 0).any(axis=2)
+        colmap_style = image_stem(path.stem) != path.stem
+        self.matched += 1
+        return _fitted(~marked if colmap_style else marked, frame, self._margin)
+
+
+class MaskModel:
+    """A semantic segmentation network in an ONNX file, such as DeepLab.
+
+    Its output is a label map, (1, h, w) of integers, or one score map per label, of which the largest wins.
+
+    Args:
+        path_or_name: the file, or a named network.
+        spec: how the network wants its image; guessed by default, see `Network`.
+        labels: labels to ignore; by default persons, animals and vehicles of PASCAL VOC.
+        margin: share of the image width by which the ignored area grows.
+
+    Raises:
+        ModelError: the network cannot be found, loaded or understood.
+        InputError: no labels, or a negative margin.
+    """
+
+    def __init__(
+        self,
+        path_or_name: str | Path,
+        spec: NetworkSpec | None = None,
+        labels: Collection[int] = MOVABLE_LABELS,
+        margin: float = DEFAULT_MARGIN,
+    ) -> None:
+        if not labels:
+            raise InputError("a mask network needs at least one label to ignore")
+        self._network = Network(find_model(path_or_name), spec)
+        self._labels = sorted(labels)
+        self._margin = _checked_margin(margin)
+        self.name = self._network.path.name
+
+    def __call__(self, frame: Frame) -> NDArray[np.bool_]:
+        """The mask of a frame.
+
+        Raises:
+            ModelError: the network fails on this frame or yields no label map.
+        """
+        labels = self._label_map(self._network(frame.image))
+        return _fitted(np.isin(labels, self._labels), frame, self._margin)
+
+    def _label_map(self, output: NDArray[Any]) -> NDArray[Any]:
+        if output.ndim == 4 and output.dtype.kind == "f" and output.shape[0] == 1:
+            axis = 1 if self._network.spec.layout == "NCHW" else 3
+            if output.shape[axis] > 1:
+                return np.asarray(output.argmax(axis=axis)[0])
+        labels = output.reshape([length for length in output.shape if length != 1])
+        if labels.ndim != 2 or labels.dtype.kind not in "iu":
+            raise ModelError(
+                f"{self.name} is not a segmentation network: expected a map of labels or one score map per "
+                f"label, got {output.dtype} of shape {output.shape}"
+            )
+        return labels
+
+
+def open_masks(spec: str | Path | MaskPrior | None) -> MaskPrior | None:
+    """The mask prior that a user means.
+
+    Args:
+        spec: a folder of masks, an ONNX file, "none" or None, or a mask prior, which is returned as it is.
+
+    Raises:
+        InputError: `spec` is none of these.
+    """
+    if spec is None or spec == "none":
+        return None
+    if not isinstance(spec, str | Path):
+        if not isinstance(spec, MaskPrior):
+            raise InputError(f"a mask prior must be callable with a frame, not {spec!r}")
+        return spec
+    if Path(spec).suffix.lower() == ".onnx":
+        return MaskModel(spec)
+    if Path(spec).is_dir():
+        return MaskFolder(spec)
+    raise InputError(f"no masks {spec}: expected an existing folder of masks, an .onnx file or none")
+
+
+def _checked_margin(margin: float) -> float:
+    if not 0.0 <= margin < 0.5:
+        raise InputError(f"the margin of masks is a share of the image width from 0 to 0.5, not {margin}")
+    return margin
+
+
+def _fitted(ignore: NDArray[np.bool_], frame: Frame, margin: float) -> NDArray[np.bool_]:
+    """The mask at the frame's size, grown by the margin."""
+    height, width = frame.image.shape[:2]
+    mask = cv2.resize(ignore.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
+    radius = round(margin * width)
+    if radius > 0:
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+        mask = cv2.dilate(mask, disc)
+    result: NDArray[np.bool_] = mask.astype(np.bool_)
+    return result

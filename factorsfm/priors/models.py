@@ -1,0 +1,118 @@
+"""Named networks: where each comes from, its checksum, and the folder it is kept in.
+
+A named network is looked for in the folder ``FACTORSFM_MODELS`` (an environment variable), then in the user's
+cache, and only then fetched. Its checksum is verified every time.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import pooch
+
+from factorsfm.errors import ModelError
+
+logger = logging.getLogger(__name__)
+
+MODELS_VARIABLE = "FACTORSFM_MODELS"
+_TIMEOUT_SECONDS = (3.0, 15.0)  # connect, read
+
+
+@dataclass(frozen=True, slots=True)
+class NamedModel:
+    """A network that can be asked for by name.
+
+    Attributes:
+        file: file name, the same in the models folder, the cache and at its origin.
+        url: where it is fetched from; pinned to one revision.
+        sha256: hexadecimal digest of the file.
+        license: of the weights.
+    """
+
+    file: str
+    url: str
+    sha256: str
+    license: str
+
+
+MODELS: dict[str, NamedModel] = {
+    "tcmonodepth": NamedModel(
+        file="tcmonodepth_tcsmallnet_192x320.onnx",
+        url="https://raw.githubusercontent.com/royshil/obs-backgroundremoval/875ffda/data/models/"
+        "tcmonodepth_tcsmallnet_192x320.onnx",
+        sha256="902b886beaebd3f68deb40bab2fd636a0c112c1ef1cbdd15fa26e5c55b389b4d",
+        license="MIT",
+    ),
+}
+
+
+def cache_folder() -> Path:
+    """The user's cache folder for networks; it may not exist yet."""
+    return Path(pooch.os_cache("factorsfm")) / "models"
+
+
+def find_model(path_or_name: str | Path) -> Path:
+    """The file of a network given by its path or its name (a key of `MODELS`).
+
+    Raises:
+        ModelError: no such file or name, a checksum that does not match, or a named network that is not on
+            this machine and cannot be fetched.
+    """
+    if str(path_or_name) in MODELS:
+        return _find_named(str(path_or_name))
+    path = Path(path_or_name)
+    if not path.is_file():
+        raise ModelError(f"there is no network {path}; expected an ONNX file or one of: {', '.join(MODELS)}")
+    return path
+
+
+def _find_named(name: str) -> Path:
+    model = MODELS[name]
+    folders = [cache_folder()]
+    if variable := os.environ.get(MODELS_VARIABLE):
+        if not Path(variable).is_dir():
+            raise ModelError(f"{MODELS_VARIABLE} must name a folder of networks, not {variable}")
+        folders.insert(0, Path(variable))
+    for folder in folders:
+        path = folder / model.file
+        if path.is_file():
+            return _verified(path, name)
+    return _fetch(name)
+
+
+def _verified(path: Path, name: str) -> Path:
+    digest = pooch.file_hash(str(path), alg="sha256")
+    expected = MODELS[name].sha256
+    if digest != expected:
+        raise ModelError(
+            f"{path} is not the network {name}: its SHA-256 starts with {digest[:12]}, expected "
+            f"{expected[:12]}; delete the file to have it fetched again"
+        )
+    return path
+
+
+def _fetch(name: str) -> Path:
+    model = MODELS[name]
+    folder = cache_folder()
+    logger.info("fetching the network %s from %s to %s", name, model.url, folder)
+    pooch.get_logger().setLevel(logging.WARNING)  # its progress lines go to stderr; ours is above
+    try:
+        pooch.retrieve(
+            model.url,
+            known_hash=f"sha256:{model.sha256}",
+            fname=model.file,
+            path=folder,
+            downloader=pooch.HTTPDownloader(timeout=_TIMEOUT_SECONDS),
+        )
+    except (
+        OSError,
+        ValueError,
+    ) as error:  # no connection, an HTTP error, a wrong checksum, a read-only cache
+        raise ModelError(
+            f"the network {name} is not on this machine and could not be fetched ({type(error).__name__}): "
+            f"set {MODELS_VARIABLE} to a folder that holds {model.file}, or pass --depth FILE or --depth none"
+        ) from error
+    return folder / model.file
