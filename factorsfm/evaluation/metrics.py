@@ -264,7 +264,7 @@ def _without_edges(truth: NDArray[np.float32]) -> NDArray[np.float32]:
     kernel = np.ones((3, 3), np.uint8)
     far = cv2.dilate(np.where(valid, truth, 0.0).astype(np.float32), kernel)
     near = cv2.erode(np.where(valid, truth, np.inf).astype(np.float32), kernel)
-    return np.where(valid & (far <= _EDGE * near), truth, np.nan).astype(np.float32)
+    return np.where(valid & (far / near <= _EDGE), truth, np.nan).astype(np.float32)
 
 
 def _relative(

@@ -1,0 +1,56 @@
+"""Footage made worse on purpose: blur, noise and compression, the same in every run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from factorsfm.errors import InputError
+from factorsfm.frames import Frame
+
+
+def degrade(
+    image: NDArray[np.uint8],
+    rng: np.random.Generator,
+    blur: float = 1.0,
+    noise: float = 8.0,
+    jpeg_quality: int = 40,
+) -> NDArray[np.uint8]:
+    """An image after a soft lens, a noisy sensor and strong compression, in this order.
+
+    Args:
+        image: (h, w, 3) BGR or (h, w) grey.
+        rng: source of the noise.
+        blur: standard deviation of the Gaussian blur, pixels; 0 = none.
+        noise: standard deviation of the noise, grey levels.
+        jpeg_quality: 1 to 100.
+
+    Raises:
+        InputError: a negative blur or noise, or a quality out of range.
+    """
+    if blur < 0 or noise < 0 or not 1 <= jpeg_quality <= 100:
+        raise InputError(
+            f"blur {blur} and noise {noise} must not be negative and JPEG quality {jpeg_quality} be 1 to 100"
+        )
+    soft = cv2.GaussianBlur(image, (0, 0), blur) if blur > 0 else image
+    noisy = soft + noise * rng.standard_normal(image.shape)
+    done, data = cv2.imencode(
+        ".jpg", np.clip(np.rint(noisy), 0, 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality]
+    )
+    if not done:
+        raise InputError(f"an image of shape {image.shape} cannot be compressed as JPEG")
+    flag = cv2.IMREAD_GRAYSCALE if image.ndim == 2 else cv2.IMREAD_COLOR
+    return np.asarray(cv2.imdecode(data, flag), np.uint8)
+
+
+def degraded_frames(
+    frames: Iterable[Frame], seed: int = 0, blur: float = 1.0, noise: float = 8.0, jpeg_quality: int = 40
+) -> Iterator[Frame]:
+    """The frames, each degraded with noise that depends on the seed and the frame's index alone."""
+    for frame in frames:
+        rng = np.random.default_rng([seed, frame.index])
+        yield replace(frame, image=degrade(frame.image, rng, blur, noise, jpeg_quality))

@@ -1,0 +1,42 @@
+"""Reads pickles of numpy arrays and plain containers, and executes nothing."""
+
+from __future__ import annotations
+
+import io
+import pickle
+from pathlib import Path
+from typing import Any
+
+from factorsfm.errors import InputError
+
+# Everything that a pickle of arrays, dtypes and numpy scalars names; containers and numbers need no name.
+_ALLOWED = {
+    ("numpy", "ndarray"),
+    ("numpy", "dtype"),
+    ("numpy._core.multiarray", "_reconstruct"),
+    ("numpy._core.multiarray", "scalar"),
+    ("numpy._core.numeric", "_frombuffer"),
+    ("collections", "OrderedDict"),
+}
+
+
+class _PlainUnpickler(pickle.Unpickler):
+    def find_class(self, module: str, name: str) -> Any:
+        module = module.replace("numpy.core.", "numpy._core.")
+        if (module, name) not in _ALLOWED:
+            raise pickle.UnpicklingError(f"it names {module}.{name}, which is no plain data")
+        return super().find_class(module, name)
+
+
+def load_plain_pickle(path: Path) -> Any:
+    """The content of a pickle of numpy arrays, numbers, strings, lists, tuples, sets and dictionaries.
+
+    Raises:
+        InputError: the file is unreadable, or the pickle names anything else; nothing of it is executed.
+    """
+    try:
+        return _PlainUnpickler(io.BytesIO(path.read_bytes())).load()
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error}") from error
+    except Exception as error:  # a damaged pickle can fail in any way
+        raise InputError(f"{path} is not a pickle of plain data: {error}") from error
