@@ -1,0 +1,246 @@
+"""Frames of a shot: from a video file, a folder of images or any iterable of images."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import re
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from factorsfm.errors import InputError
+
+IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"})
+
+_RANGE = re.compile(r"(\d*):(\d*)(?::(\d+))?", re.ASCII)
+_JPEG_MARKER = re.compile(rb"\xff+([^\x00\xff\xd0-\xd7])", re.DOTALL)  # neither stuffing nor a restart
+
+# FFmpeg reports broken files on stderr, past all Python logging; a level that the user set is respected.
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """One image of a shot.
+
+    Attributes:
+        index: position in the source, counted from 0 before any range or step is applied.
+        image: (h, w, 3) uint8, BGR.
+        name: file name, or the zero-padded index for videos and iterables.
+        timestamp: seconds from the start of the video, None where unknown.
+    """
+
+    index: int
+    image: NDArray[np.uint8]
+    name: str
+    timestamp: float | None = None
+
+
+def parse_range(text: str) -> slice:
+    """Parse ``START:STOP[:STEP]``, counted from 0 without STOP; START or STOP may be left out.
+
+    Raises:
+        InputError: another form, a negative number, a step of zero, or a range that holds no frame.
+    """
+    match = _RANGE.fullmatch(text.strip())
+    if match is None or not any(match.groups()):
+        raise InputError(f'frame range "{text}" is not START:STOP[:STEP] with whole numbers from 0')
+    start, stop, step = (int(part) if part else None for part in match.groups())
+    return _checked_range(slice(start, stop, step))
+
+
+def read_frames(
+    source: str | Path | Iterable[NDArray[np.uint8] | NDArray[np.uint16] | Frame], frames: slice | None = None
+) -> Iterator[Frame]:
+    """Read the frames of a shot one by one, in bounded memory.
+
+    Grey, 16-bit and alpha images become 8-bit BGR; the EXIF orientation is applied.
+
+    Args:
+        source: video file, folder of images (in natural order: img2 before img10; other files are ignored),
+            or iterable of images, (h, w), (h, w, 3) or (h, w, 4), uint8 or uint16, or of `Frame` objects,
+            which keep their index, name and timestamp.
+        frames: the part to read, e.g. ``slice(0, 100, 2)``; no negative numbers.
+
+    Raises:
+        InputError: at the call, if the source is missing, is no video or holds no images; while iterating,
+            if an image is unreadable or truncated, if a frame has another size than the first one, or if
+            there is no frame to read.
+    """
+    selection = _checked_range(frames if frames is not None else slice(None))
+    if isinstance(source, (str, Path)):
+        path = Path(source)
+        if path.is_dir():
+            found = _folder_frames(_list_images(path), selection)
+        elif path.is_file():
+            found = _video_frames(path, selection, has_timestamps=_probe_video(path))
+        else:
+            raise InputError(f"{path} does not exist; a video file or a folder of images is expected")
+        return _uniform(found, str(path), selection.start)
+    if isinstance(source, np.ndarray) and (
+        source.ndim == 2 or (source.ndim == 3 and source.shape[-1] in (3, 4))
+    ):
+        raise InputError(
+            f"an array of shape {source.shape} is a single image; a sequence of images is expected"
+        )
+    if not isinstance(source, Iterable):
+        raise InputError(
+            f"frames cannot be read from a {type(source).__name__}; "
+            "a video file, a folder of images or an iterable of images is expected"
+        )
+    return _uniform(_array_frames(source, selection), "the sequence of images", selection.start)
+
+
+def _checked_range(frames: slice) -> slice:
+    start, stop, step = frames.start or 0, frames.stop, 1 if frames.step is None else frames.step
+    text = _range_text(frames)
+    if start < 0 or (stop is not None and stop < 0) or step < 0:
+        raise InputError(f"frame range {text} holds a negative number; frames are counted from 0")
+    if step == 0:
+        raise InputError(f"frame range {text} has step 0; the step must be at least 1")
+    if stop is not None and stop <= start:
+        raise InputError(f"frame range {text} is empty; STOP must be larger than START")
+    return slice(start, stop, step)
+
+
+def _range_text(frames: slice) -> str:
+    start, stop = ("" if part is None else str(part) for part in (frames.start, frames.stop))
+    return f"{start}:{stop}" + ("" if frames.step is None else f":{frames.step}")
+
+
+def _uniform(frames: Iterator[Frame], source: str, start: int) -> Iterator[Frame]:
+    """Pass the frames on and insist that there is one at least and that all have one size."""
+    first: Frame | None = None
+    for frame in frames:
+        first = first or frame
+        (height, width), (first_height, first_width) = frame.image.shape[:2], first.image.shape[:2]
+        if (height, width) != (first_height, first_width):
+            raise InputError(
+                f"frame {frame.index} ({frame.name}) of {source} has {width}x{height} pixels, "
+                f"but the first one ({first.name}) has {first_width}x{first_height}"
+            )
+        yield frame
+    if first is None:
+        raise InputError(f"{source} holds no frames" + (f" from number {start} on" if start else ""))
+
+
+def _array_frames(
+    images: Iterable[NDArray[np.uint8] | NDArray[np.uint16] | Frame], selection: slice
+) -> Iterator[Frame]:
+    chosen = itertools.islice(enumerate(images), selection.start, selection.stop, selection.step)
+    for index, image in chosen:
+        if isinstance(image, Frame):
+            yield replace(image, image=_bgr(image.image, index))
+        else:
+            yield Frame(index, _bgr(image, index), f"{index:06d}")
+
+
+def _bgr(image: object, index: int) -> NDArray[np.uint8]:
+    if not isinstance(image, np.ndarray) or image.dtype not in (np.uint8, np.uint16):
+        found = f"array of {image.dtype}" if isinstance(image, np.ndarray) else type(image).__name__
+        raise InputError(f"frame {index} is a {found}; an array of uint8 or uint16 is expected")
+    channels = image.shape[2] if image.ndim == 3 else 1
+    if image.ndim not in (2, 3) or channels not in (1, 3, 4) or image.size == 0:
+        raise InputError(f"frame {index} has shape {image.shape}; (h, w), (h, w, 3) or (h, w, 4) is expected")
+    depth8 = image if image.dtype == np.uint8 else (image >> 8).astype(np.uint8)
+    if channels == 1:
+        return np.repeat(depth8.reshape(*depth8.shape[:2], 1), 3, axis=2)
+    return np.ascontiguousarray(depth8[:, :, :3])
+
+
+def _list_images(folder: Path) -> list[Path]:
+    images = [
+        path
+        for path in folder.iterdir()
+        if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".") and path.is_file()
+    ]
+    if not images:
+        suffixes = ", ".join(sorted(suffix[1:] for suffix in IMAGE_SUFFIXES))
+        raise InputError(f"folder {folder} holds no images ({suffixes})")
+    return sorted(images, key=lambda path: (_natural_key(path.name), path.name))
+
+
+def _natural_key(name: str) -> list[str | int]:
+    return [int(part) if i % 2 else part.lower() for i, part in enumerate(re.split(r"(\d+)", name))]
+
+
+def _folder_frames(paths: list[Path], selection: slice) -> Iterator[Frame]:
+    for index in range(len(paths))[selection]:
+        yield Frame(index, _read_image(paths[index]), paths[index].name)
+
+
+def _read_image(path: Path) -> NDArray[np.uint8]:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"image {path} cannot be read: {error.strerror}") from error
+    if data.startswith(b"\xff\xd8") and _jpeg_is_truncated(data):
+        raise InputError(f"image {path} is truncated")
+    with _quiet_opencv():
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+    if image is None:
+        raise InputError(f"image {path} cannot be decoded; it is damaged, truncated or not an image")
+    return np.asarray(image, dtype=np.uint8)
+
+
+def _jpeg_is_truncated(data: bytes) -> bool:
+    """Whether the end marker is missing: the decoder fills the rest with grey and reports success."""
+    position = 2
+    while marker := _JPEG_MARKER.search(data, position):
+        if marker[1] == b"\xd9":
+            return False
+        position = marker.end() + int.from_bytes(data[marker.end() : marker.end() + 2], "big")
+    return True
+
+
+def _probe_video(path: Path) -> bool:
+    """Whether the container has timestamps (without them every frame is said to be at 0)."""
+    if path.suffix.lower() in IMAGE_SUFFIXES:
+        raise InputError(f"{path} is a single image; a video file or a folder of images is expected")
+    with _open_video(path) as video:
+        if not video.grab():
+            raise InputError(f"{path} cannot be decoded as a video; it is damaged or not a video")
+        return bool(video.grab() and video.get(cv2.CAP_PROP_POS_MSEC) > 0)
+
+
+def _video_frames(path: Path, selection: slice, has_timestamps: bool) -> Iterator[Frame]:
+    # Neither the frame count nor seeking can be trusted in general: decode in order from the start.
+    last = selection.stop - 1 if selection.stop is not None else None
+    with _open_video(path) as video:
+        for index in itertools.count():
+            if (last is not None and index > last) or not video.grab():
+                return
+            if index < selection.start or (index - selection.start) % selection.step:
+                continue
+            timestamp = video.get(cv2.CAP_PROP_POS_MSEC) / 1000 if has_timestamps else None
+            decoded, image = video.retrieve()
+            if not decoded:
+                raise InputError(f"frame {index} of {path} cannot be decoded")
+            yield Frame(index, _bgr(image, index), f"{index:06d}", timestamp)
+
+
+@contextmanager
+def _open_video(path: Path) -> Iterator[cv2.VideoCapture]:
+    with _quiet_opencv():
+        video = cv2.VideoCapture(str(path))
+    try:
+        yield video
+    finally:
+        video.release()
+
+
+@contextmanager
+def _quiet_opencv() -> Iterator[None]:
+    """Keep OpenCV from writing to stderr what is reported as an InputError."""
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        yield
+    finally:
+        cv2.utils.logging.setLogLevel(level)
