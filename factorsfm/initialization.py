@@ -1,0 +1,148 @@
+"""The start of a reconstruction: from one image lifted by its depth, from the paper's pair, or without depth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from factorsfm.refinement import Observations
+from factorsfm.registration import ImageDepth, register_image
+from factorsfm.triangulation import triangulate
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+# A relative inverse depth of (almost) zero is a point at (almost) infinity; nothing is lifted farther than this.
+_FARTHEST = 20.0
+
+
+@dataclass(frozen=True, slots=True)
+class ImageTracks:
+    """What the mapper knows of an image: its tracks, and the depth prior at them where it has one.
+
+    Attributes:
+        position: index among the frames seen.
+        ids: (n,) identities of the tracks, ascending.
+        xy: (n, 2) undistorted normalised image coordinates.
+        depth: prior at the n keypoints.
+    """
+
+    position: int
+    ids: Index
+    xy: Array
+    depth: ImageDepth | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """Initial map: images with their poses, and points by track.
+
+    Attributes:
+        images: positions of the registered images.
+        rotation, translation: `cam_from_world` of each.
+        ids: (n,) tracks with a point; points: (n, 3).
+    """
+
+    images: list[int]
+    rotation: list[Array]
+    translation: list[Array]
+    ids: Index
+    points: Array
+
+
+@dataclass(frozen=True, slots=True)
+class NoStart:
+    """Why there is no start yet, with numbers."""
+
+    reason: str
+
+
+def lift(xy: Array, depth: ImageDepth) -> tuple[Array, NDArray[np.bool_]]:
+    """``P = D[p] K^-1 h(p)`` in the camera frame, with depths in units of the image's median.
+
+    Returns:
+        Points (n, 3) and which are valid.
+    """
+    valid = depth.valid
+    inverse = np.where(valid, np.maximum(depth.inverse_depth, 1.0 / _FARTHEST), 1.0)
+    return np.concatenate([xy, np.ones((len(xy), 1))], 1) / inverse[:, None], valid
+
+
+def start_lifted(image: ImageTracks, min_tracks: int) -> Start | NoStart:
+    """One image is enough: its lifted points are the map on which the next images are registered."""
+    if image.depth is None:
+        return NoStart(f"frame {image.position} has no depth map to lift")
+    points, valid = lift(image.xy, image.depth)
+    if valid.sum() < min_tracks:
+        return NoStart(f"{valid.sum()} of {min_tracks} needed tracks have a valid depth")
+    return Start([image.position], [np.eye(3)], [np.zeros(3)], image.ids[valid], points[valid])
+
+
+def start_pair(images: list[ImageTracks], min_tracks: int, *, focal: float, sigma: float, inlier_px: float) -> Start | NoStart:
+    """The paper's start: the pair with most matches of valid depth, lift the first image, PnP the second."""
+    best, best_count = None, 0
+    for i, a in enumerate(images):
+        if a.depth is None:
+            continue
+        valid = a.ids[a.depth.valid]
+        for b in images[:i] + images[i + 1 :]:
+            count = int(np.isin(b.ids, valid, assume_unique=True).sum())
+            if count > best_count:
+                best, best_count = (a, b), count
+    if best is None or best_count < min_tracks:
+        return NoStart(f"the best pair has {best_count} of {min_tracks} needed matches with a valid depth")
+    a, b = best
+    assert a.depth is not None
+    points, valid = lift(a.xy, a.depth)
+    shared, in_a, in_b = np.intersect1d(a.ids, b.ids, assume_unique=True, return_indices=True)
+    use = valid[in_a]
+    result = register_image(
+        points[in_a[use]], b.xy[in_b[use]], np.eye(3), np.zeros(3), focal=focal, sigma=sigma, inlier_px=inlier_px
+    )
+    if result.inliers.sum() < min_tracks // 2:
+        return NoStart(f"PnP of the best pair has {result.inliers.sum()} of {min_tracks // 2} needed inliers")
+    return Start(
+        [a.position, b.position], [np.eye(3), result.rotation], [np.zeros(3), result.translation],
+        a.ids[valid], points[valid],
+    )  # fmt: skip
+
+
+def start_essential(
+    first: ImageTracks, second: ImageTracks, min_tracks: int, *, focal: float, sigma: float, angle_deg: float
+) -> Start | NoStart:
+    """The start without depth: essential matrix, then triangulation, accepted if its rays meet at an angle.
+
+    The median depth of the points is the unit of the map.
+    """
+    ids, in_a, in_b = np.intersect1d(first.ids, second.ids, assume_unique=True, return_indices=True)
+    if len(ids) < min_tracks:
+        return NoStart(f"{len(ids)} of {min_tracks} needed tracks join frames {first.position} and {second.position}")
+    a, b = first.xy[in_a], second.xy[in_b]
+    essential, mask = cv2.findEssentialMat(
+        a, b, np.eye(3), method=cv2.USAC_MAGSAC, prob=0.9999, threshold=3.0 * sigma / focal
+    )
+    if essential is None or essential.shape != (3, 3):
+        return NoStart(f"no essential matrix fits frames {first.position} and {second.position}")
+    _, rotation, translation, _ = cv2.recoverPose(essential, a, b, np.eye(3), mask=mask.copy())
+    keep = mask.ravel() > 0
+    n = int(keep.sum())
+    observations = Observations(np.tile([0, 1], n), np.repeat(np.arange(n), 2), np.stack([a[keep], b[keep]], 1).reshape(-1, 2))
+    points = triangulate(
+        np.stack([np.eye(3), rotation]), np.stack([np.zeros(3), translation.ravel()]), observations,
+        focal=focal, inlier_px=4.0 * sigma, sigma=sigma, fallback=np.full(n, 1e-6),
+    )  # fmt: skip
+    good = (points.inliers == 2) & (points.inverse_distance > 1e-4)
+    angle = float(np.degrees(np.median(points.angle[good]))) if good.any() else 0.0
+    if good.sum() < min_tracks or angle < angle_deg:
+        return NoStart(
+            f"{good.sum()} of {min_tracks} needed points with a median triangulation angle of {angle:.2f} of "
+            f"{angle_deg:.2f} degrees needed"
+        )
+    unit = float(np.median(points.inverse_distance[good]))
+    return Start(
+        [first.position, second.position], [np.eye(3), rotation], [np.zeros(3), translation.ravel() * unit],
+        ids[keep][good], points.bearing[good] / points.inverse_distance[good, None] * unit,
+    )  # fmt: skip

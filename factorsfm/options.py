@@ -1,0 +1,165 @@
+"""Options: frozen dataclasses with units in the names, and the named presets."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Literal
+
+from factorsfm.errors import InputError
+
+DepthUse = Literal["none", "paper", "inverse"]
+
+
+@dataclass(frozen=True, slots=True)
+class TrackerOptions:
+    """Tracking in video (`tracks.flow`).
+
+    Attributes:
+        max_tracks: tracks alive at a time.
+        replenish_below: start new tracks when this share of `max_tracks` is free.
+        window_px: side of the Lucas-Kanade window.
+        levels: pyramid levels above the full image in the flow from frame to frame.
+        border_px: distance to the image border that tracks keep.
+        flow_check_px: largest forward-backward error of the flow from frame to frame.
+        realign_check_px: largest forward-backward error of the re-alignment with the birth patch.
+        realign_reach_px: largest correction by the re-alignment.
+        corner_quality: weakest corner as a share of the strongest (Shi-Tomasi).
+    """
+
+    max_tracks: int = 1000
+    replenish_below: float = 0.1
+    window_px: int = 21
+    levels: int = 4
+    border_px: int = 6
+    flow_check_px: float = 0.7
+    realign_check_px: float = 0.3
+    realign_reach_px: float = 3.0
+    corner_quality: float = 0.002
+
+
+@dataclass(frozen=True, slots=True)
+class MapperOptions:
+    """The three steps of the paper and the incremental graph (`mapper`).
+
+    Attributes:
+        initialization: "lifted" lifts the first image alone and registers the next frames on it; "pair" is the
+            paper's: the pair with most matches of valid depth, lift and PnP; "essential" uses no depth.
+        registration_depth, triangulation_depth: depth residual in these steps: none, the paper's in the depth
+            domain, or ours in the inverse-depth domain.
+        graph_depth: depth-consistency factors with free scale and shift in the incremental graph.
+        depth_weight: the paper's lambda.
+        min_tracks: fewest tracked points with which a frame is registered.
+        min_inliers: fewest inliers of a registered frame.
+        inlier_px: largest reprojection error of an inlier at registration, widened where the map is still rough.
+        keyframe_flow: median flow since the last keyframe that makes a new one (share of the image width).
+        keyframe_interval: frames after which a keyframe is made at the latest.
+        landmarks: landmarks alive in the graph per keyframe.
+        pixel_sigma: standard deviation of a tracked point in the graph (pixels).
+        essential_angle_deg: median triangulation angle that a start without depth waits for.
+    """
+
+    initialization: Literal["lifted", "pair", "essential"] = "lifted"
+    registration_depth: DepthUse = "none"
+    triangulation_depth: DepthUse = "inverse"
+    graph_depth: bool = True
+    depth_weight: float = 6.0
+    min_tracks: int = 30
+    min_inliers: int = 15
+    inlier_px: float = 3.0
+    keyframe_flow: float = 0.02
+    keyframe_interval: int = 12
+    landmarks: int = 250
+    pixel_sigma: float = 0.25
+    essential_angle_deg: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class PolishOptions:
+    """The batch polish (`refinement`).
+
+    Attributes:
+        depth: whether the prior takes part, with the weight that its own residuals justify.
+        iterations: at most, in each stage.
+        tolerance: relative decrease of the cost at which a stage ends.
+        kernel: scale of the Cauchy kernel in standard deviations.
+        min_track_length: frames in which a track must be seen.
+        point_sigma: weak prior of every inverse distance around its start, in units of the scene's median.
+        outlier_sigmas: tracks beyond this many robust standard deviations of all tracks are removed.
+    """
+
+    depth: bool = True
+    iterations: int = 60
+    tolerance: float = 1e-6
+    kernel: float = 2.0
+    min_track_length: int = 5
+    point_sigma: float = 1.0
+    outlier_sigmas: float = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """Everything that can be set.
+
+    Attributes:
+        preset: name from which the options were made.
+        refine_focal_length: whether the polish estimates the focal length (for a guessed lens).
+    """
+
+    preset: str = "default"
+    refine_focal_length: bool = False
+    tracker: TrackerOptions = field(default_factory=TrackerOptions)
+    mapper: MapperOptions = field(default_factory=MapperOptions)
+    polish: PolishOptions = field(default_factory=PolishOptions)
+
+    @classmethod
+    def preset_named(cls, name: str) -> Options:
+        """The options of a preset.
+
+        Raises:
+            InputError: no preset has this name.
+        """
+        if name not in PRESETS:
+            raise InputError(f"unknown preset '{name}', expected one of {', '.join(PRESETS)}")
+        return PRESETS[name]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data, as written beside every result."""
+        return asdict(self)
+
+    @property
+    def uses_depth(self) -> bool:
+        """Whether any step reads the depth prior."""
+        m = self.mapper
+        return (
+            self.polish.depth
+            or m.graph_depth
+            or m.initialization != "essential"
+            or m.registration_depth != "none"
+            or m.triangulation_depth != "none"
+        )
+
+
+def _variant(name: str, mapper: MapperOptions, *, polish_depth: bool = False) -> Options:
+    return replace(
+        Options(), preset=name, mapper=mapper, polish=replace(PolishOptions(), depth=polish_depth)
+    )
+
+
+_PAPER = MapperOptions(
+    initialization="pair", registration_depth="paper", triangulation_depth="paper", graph_depth=False
+)
+
+PRESETS: dict[str, Options] = {
+    "default": Options(),
+    "paper": _variant("paper", _PAPER),
+    "paper-init-only": _variant(
+        "paper-init-only", replace(_PAPER, registration_depth="none", triangulation_depth="none")
+    ),
+    "paper-opt-only": _variant("paper-opt-only", replace(_PAPER, initialization="essential")),
+    "geometry": _variant(
+        "geometry",
+        MapperOptions(
+            initialization="essential", registration_depth="none", triangulation_depth="none", graph_depth=False
+        ),
+    ),
+}

@@ -1,0 +1,456 @@
+"""The batch polish: all frames and all tracks on the factors of the graph, points eliminated first.
+
+The normal equations are those of the factor graph with the elimination order *points, then everything else*. In these
+shots every camera sees every point, so what remains after the points is one dense block, which numpy solves an order
+of magnitude faster than a general multifrontal solver (see benchmarks). Points are unit bearings with an inverse
+distance, in which small motion is almost linear.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorsfm.factors import affine_inverse_depth, camera_points, cauchy, d_camera_points_d_pose, reprojection
+from factorsfm.options import PolishOptions
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+_CHUNK = 512  # points eliminated together
+_FIRST_DAMPING = 1e-4
+_LARGEST_DAMPING = 1e6
+
+
+@dataclass(frozen=True, slots=True)
+class Observations:
+    """m observations of n points in k frames, sorted by point.
+
+    Attributes:
+        frame, point: (m,) indices.
+        xy: (m, 2) undistorted normalised image coordinates.
+    """
+
+    frame: Index
+    point: Index
+    xy: Array
+
+
+@dataclass(frozen=True, slots=True)
+class PriorObservations:
+    """Values of the depth prior at observations, sorted by point.
+
+    Attributes:
+        image: (m,) which affine; frame, point: (m,) as in `Observations`.
+        inverse_depth: (m,) values of the prior's maps.
+        sigma: (m,) standard deviation of the independent part of the error.
+        nodes, node_weights: (m, 4) nodes of the smooth error field around each point and their weights.
+        field_information: (nodes, nodes) inverse covariance of the field.
+        scale_sigma, shift_sigma: priors of each affine around 1 and 0 (scale: of the logarithm).
+    """
+
+    image: Index
+    frame: Index
+    point: Index
+    inverse_depth: Array
+    sigma: Array
+    nodes: Index
+    node_weights: Array
+    field_information: Array
+    scale_sigma: float
+    shift_sigma: float
+
+
+@dataclass(slots=True)
+class State:
+    """All variables.
+
+    Attributes:
+        rotation (k, 3, 3), translation (k, 3): `cam_from_world`.
+        bearing (n, 3) unit, inverse_distance (n,): points seen from the world's origin.
+        log_focal: logarithm of the focal length in pixels.
+        scale, shift: (images,) affine of each image with a prior.
+        field: (nodes,) smooth error of the prior in units of inverse depth, shared by all its images.
+    """
+
+    rotation: Array
+    translation: Array
+    bearing: Array
+    inverse_distance: Array
+    log_focal: float
+    scale: Array = field(default_factory=lambda: np.zeros(0))
+    shift: Array = field(default_factory=lambda: np.zeros(0))
+    field: Array = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def points(self) -> Array:
+        """(n, 3) Euclidean points; those at infinity end up very far away."""
+        return self.bearing / np.maximum(self.inverse_distance, 1e-9)[:, None]
+
+    def camera_points(self, frame: Index, point: Index) -> Array:
+        """(m, 3) homogeneous camera-frame vectors `q` of `factors.camera_points`."""
+        return camera_points(
+            self.rotation[frame], self.translation[frame], self.bearing[point], self.inverse_distance[point]
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _Term:
+    """Linearised residuals: rows (m, d), Jacobians by camera-side columns (m, d, c) and by points (m, d, 3)."""
+
+    residual: Array
+    by_camera: Array
+    columns: Index
+    by_point: Array
+    point: Index
+
+
+@dataclass(slots=True)
+class _Normal:
+    """Normal equations before the points are eliminated."""
+
+    camera: Array  # (c, c)
+    camera_gradient: Array  # (c,)
+    point: Array  # (n, 3, 3)
+    point_gradient: Array  # (n, 3)
+    terms: list[_Term]
+
+
+class BundleAdjustment:
+    """Levenberg-Marquardt over poses, points, focal length, prior affines and the prior's smooth error field.
+
+    Args:
+        observations: sorted by point; every point has at least one.
+        sigma: standard deviation of an observation (pixels).
+        free_translation: False estimates rotations and bearings alone.
+        free_focal: whether the focal length is estimated.
+        points_only: True holds everything but the points fixed.
+        prior: depth-prior values, or None.
+    """
+
+    def __init__(
+        self,
+        state: State,
+        observations: Observations,
+        options: PolishOptions,
+        *,
+        sigma: float,
+        free_translation: bool = True,
+        free_focal: bool = False,
+        points_only: bool = False,
+        prior: PriorObservations | None = None,
+    ) -> None:
+        if (np.diff(observations.point) < 0).any():
+            raise ValueError("observations must be sorted by point")
+        self.state = state
+        self.observations = observations
+        self.options = options
+        self.sigma = sigma
+        self.prior = prior
+        self.iterations = 0
+        self._anchor = state.inverse_distance.copy()
+        frames, images, nodes = len(state.rotation), len(state.scale), len(state.field)
+        self._lens = 6 * frames
+        self._affine = self._lens + 1
+        self._field = self._affine + 2 * images
+        self._columns = self._field + nodes
+        free = np.ones(self._columns, bool)
+        free[:6] = False  # the first camera is the world
+        free[self._lens] = free_focal
+        if not free_translation:
+            free[: self._lens].reshape(-1, 6)[:, 3:] = False
+        self._free = np.nonzero(free & (not points_only))[0]
+        self._groups: list[list[tuple[Index, Index, Index]]] | None = None
+        self._chunks: list[tuple[list[NDArray[np.intp]], Index, slice]] | None = None
+
+    # --- residuals ----------------------------------------------------------------------------------------------
+
+    def reprojection_errors(self) -> Array:
+        """(m,) distance between observed and predicted position (pixels)."""
+        return np.asarray(np.linalg.norm(self._reprojection(self.state)[0], axis=1) * self.sigma)
+
+    def _reprojection(self, state: State) -> tuple[Array, Array, Array]:
+        o = self.observations
+        q = state.camera_points(o.frame, o.point)
+        behind = q[:, 2] <= 1e-6
+        q[behind, 2] = 1e-6
+        residual, by_q = reprojection(q, o.xy, np.exp(state.log_focal))
+        by_q[behind] = 0.0
+        return residual / self.sigma, by_q / self.sigma, q
+
+    def prior_residuals(self, state: State | None = None) -> Array:
+        """(m,) residuals of the prior (unit of its inverse depth)."""
+        assert self.prior is not None
+        return self._prior(state or self.state)[0] * self.prior.sigma
+
+    def _prior(self, state: State) -> tuple[Array, Array, Array, Array, Array]:
+        p = self.prior
+        assert p is not None
+        q = state.camera_points(p.frame, p.point)
+        q[:, 2] = np.maximum(q[:, 2], 1e-6)
+        w = state.inverse_distance[p.point]
+        scale, smooth = state.scale[p.image], (state.field[p.nodes] * p.node_weights).sum(1)
+        residual, by_z, by_w = affine_inverse_depth(q, w, scale, state.shift[p.image], p.inverse_depth)
+        return (residual + scale * smooth) / p.sigma, by_z / p.sigma, by_w / p.sigma, q, w / q[:, 2] + smooth
+
+    def _cost(self, state: State) -> float:
+        cost = cauchy(self._reprojection(state)[0], self.options.kernel)[0].sum()
+        cost += 0.5 * (((state.inverse_distance - self._anchor) / self._point_sigma) ** 2).sum()
+        if (p := self.prior) is not None:
+            cost += cauchy(self._prior(state)[0][:, None], self.options.kernel)[0].sum()
+            cost += 0.5 * state.field @ p.field_information @ state.field
+            cost += 0.5 * (((state.scale - 1.0) / p.scale_sigma) ** 2).sum()
+            cost += 0.5 * ((state.shift / p.shift_sigma) ** 2).sum()
+        return float(cost)
+
+    @property
+    def _point_sigma(self) -> float:
+        return self.options.point_sigma * max(float(np.median(self._anchor)), 1e-9)
+
+    # --- linearisation ------------------------------------------------------------------------------------------
+
+    def _terms(self) -> list[_Term]:
+        s, o = self.state, self.observations
+        tangent = _tangent_basis(s.bearing)
+        residual, by_q, q = self._reprojection(s)
+        weight = np.sqrt(cauchy(residual, self.options.kernel)[1])[:, None]
+        by_q *= weight[:, :, None]
+        by_focal = (by_q[:, :, :2] @ q[:, :2, None])[:, :, 0]  # d r / d log f = f q_xy / q_z
+        by_pose = by_q @ d_camera_points_d_pose(q, s.inverse_distance[o.point])
+        columns = np.concatenate([6 * o.frame[:, None] + np.arange(6), np.full((len(q), 1), self._lens)], 1)
+        terms = [
+            _Term(
+                residual * weight,
+                np.concatenate([by_pose, by_focal[:, :, None]], 2),
+                columns,
+                by_q @ self._by_point(tangent, o.frame, o.point),
+                o.point,
+            )
+        ]
+        if (p := self.prior) is not None:
+            value, by_z, by_w, q, prediction = self._prior(s)
+            weight_1 = np.sqrt(cauchy(value[:, None], self.options.kernel)[1])
+            by_z, by_w, unit = by_z * weight_1, by_w * weight_1, weight_1 / p.sigma
+            by_pose = by_z[:, None] * d_camera_points_d_pose(q, s.inverse_distance[p.point])[:, 2]
+            by_point = by_z[:, None] * self._by_point(tangent, p.frame, p.point)[:, 2]
+            by_point[:, 2] += by_w
+            by_affine = np.stack([prediction * unit, unit], -1)
+            by_field = (s.scale[p.image] * unit)[:, None] * p.node_weights
+            columns = np.concatenate(
+                [
+                    6 * p.frame[:, None] + np.arange(6),
+                    self._affine + 2 * p.image[:, None] + np.arange(2),
+                    self._field + p.nodes,
+                ],
+                1,
+            )
+            by_camera = np.concatenate([by_pose, by_affine, by_field], 1)
+            terms.append(
+                _Term((value * weight_1)[:, None], by_camera[:, None], columns, by_point[:, None], p.point)
+            )
+        return terms
+
+    def _by_point(self, tangent: Array, frame: Index, point: Index) -> Array:
+        """(m, 3, 3) derivative of `q` by the bearing's two tangent directions and the inverse distance."""
+        by_bearing = self.state.rotation[frame] @ tangent[point]
+        return np.concatenate([by_bearing, self.state.translation[frame][:, :, None]], 2)
+
+    def _linearize(self) -> _Normal:
+        s, c, n = self.state, self._columns, len(self.state.bearing)
+        terms = self._terms()
+        camera, gradient = np.zeros((c, c)), np.zeros(c)
+        point, point_gradient = np.zeros((n, 3, 3)), np.zeros((n, 3))
+        for t, groups in zip(terms, self._frame_groups(terms), strict=True):
+            for rows, columns, local in groups:
+                dense = np.zeros((len(rows), t.residual.shape[1], len(columns)))
+                np.put_along_axis(dense, local, t.by_camera[rows], 2)
+                dense = dense.reshape(-1, len(columns))
+                camera[np.ix_(columns, columns)] += dense.T @ dense
+                gradient[columns] += t.residual[rows].ravel() @ dense
+            seen, first = np.unique(t.point, return_index=True)
+            point[seen] += np.add.reduceat(np.einsum("mdi,mdj->mij", t.by_point, t.by_point), first)
+            point_gradient[seen] += np.add.reduceat(np.einsum("mdi,md->mi", t.by_point, t.residual), first)
+        point[:, 2, 2] += 1.0 / self._point_sigma**2
+        point_gradient[:, 2] += (s.inverse_distance - self._anchor) / self._point_sigma**2
+        if (p := self.prior) is not None:
+            affine = np.arange(self._affine, self._field)
+            information = np.tile([p.scale_sigma**-2.0, p.shift_sigma**-2.0], len(s.scale))
+            camera[affine, affine] += information
+            gradient[affine] += information * np.stack([s.scale - 1.0, s.shift], -1).ravel()
+            camera[self._field :, self._field :] += p.field_information
+            gradient[self._field :] += p.field_information @ s.field
+        return _Normal(camera, gradient, point, point_gradient, terms)
+
+    def _frame_groups(self, terms: list[_Term]) -> list[list[tuple[Index, Index, Index]]]:
+        """For every term and frame: its rows, their columns, and the position of each Jacobian entry among them."""
+        if self._groups is None:
+            self._groups = []
+            for t, frame in zip(terms, self._frames_of_terms(), strict=True):
+                order = np.argsort(frame, kind="stable")
+                groups = []
+                for rows in np.split(order, np.nonzero(np.diff(frame[order]))[0] + 1):
+                    columns, local = np.unique(t.columns[rows], return_inverse=True)
+                    shape = (len(rows), t.residual.shape[1], t.columns.shape[1])
+                    groups.append((rows, columns, np.broadcast_to(local.reshape(len(rows), 1, -1), shape)))
+                self._groups.append(groups)
+        return self._groups
+
+    def _frames_of_terms(self) -> list[Index]:
+        return [self.observations.frame] + ([] if self.prior is None else [self.prior.frame])
+
+    def _chunk_indices(self, terms: list[_Term]) -> list[tuple[list[NDArray[np.intp]], Index, slice]]:
+        """For every chunk of points: flat positions of the cross blocks of each term, the columns, the points."""
+        if self._chunks is None:
+            self._chunks = []
+            n = len(self.state.bearing)
+            for begin in range(0, n, _CHUNK):
+                end = min(n, begin + _CHUNK)
+                rows = [slice(*np.searchsorted(t.point, [begin, end])) for t in terms]
+                columns = np.unique(np.concatenate([t.columns[r].ravel() for t, r in zip(terms, rows, strict=True)]))
+                flat = []
+                for t, r in zip(terms, rows, strict=True):
+                    local = np.searchsorted(columns, t.columns[r])
+                    position = local[:, :, None] * 3 * (end - begin) + 3 * (t.point[r] - begin)[:, None, None]
+                    flat.append((position + np.arange(3)).ravel())
+                self._chunks.append((flat, columns, slice(begin, end)))
+        return self._chunks
+
+    def _cross_blocks(self, normal: _Normal) -> list[tuple[Array, Index, slice]]:
+        """Camera-point blocks of the information matrix, dense over the columns of each chunk."""
+        blocks = []
+        for flat, columns, span in self._chunk_indices(normal.terms):
+            n = span.stop - span.start
+            cross = np.zeros(len(columns) * 3 * n)
+            for t, position in zip(normal.terms, flat, strict=True):
+                rows = slice(*np.searchsorted(t.point, [span.start, span.stop]))
+                values = t.by_camera[rows].transpose(0, 2, 1) @ t.by_point[rows]
+                cross += np.bincount(position, values.ravel(), len(cross))
+            blocks.append((cross.reshape(len(columns), 3 * n), columns, span))
+        return blocks
+
+    # --- solving ------------------------------------------------------------------------------------------------
+
+    def _reduced(
+        self, normal: _Normal, blocks: list[tuple[Array, Index, slice]], damping: float
+    ) -> tuple[Array, Array, Array]:
+        """Information and gradient of the camera side with the points eliminated, and the points' covariance."""
+        point = normal.point.copy()
+        diagonal = np.einsum("nii->ni", point)
+        diagonal += damping * diagonal + 1e-12
+        point_covariance = np.linalg.inv(point)
+        root = np.linalg.cholesky(point_covariance)
+        information = normal.camera.copy()
+        information[np.diag_indices_from(information)] *= 1.0 + damping
+        gradient = normal.camera_gradient.copy()
+        for cross, columns, span in blocks:
+            n = span.stop - span.start
+            half = (cross.reshape(-1, n, 3).transpose(1, 0, 2) @ root[span]).transpose(1, 0, 2).reshape(-1, 3 * n)
+            information[np.ix_(columns, columns)] -= half @ half.T
+            step = np.einsum("nij,nj->ni", point_covariance[span], normal.point_gradient[span])
+            gradient[columns] -= cross @ step.ravel()
+        return information, gradient, point_covariance
+
+    def _step(
+        self, normal: _Normal, blocks: list[tuple[Array, Index, slice]], damping: float
+    ) -> tuple[Array, Array]:
+        information, gradient, point_covariance = self._reduced(normal, blocks, damping)
+        free = self._free
+        camera = np.zeros(self._columns)
+        camera[free] = -np.linalg.solve(_conditioned(information[np.ix_(free, free)]), gradient[free])
+        point = np.empty((len(self.state.bearing), 3))
+        for cross, columns, span in blocks:
+            pull = normal.point_gradient[span] + (camera[columns] @ cross).reshape(-1, 3)
+            point[span] = -np.einsum("nij,nj->ni", point_covariance[span], pull)
+        return camera, point
+
+    def _retract(self, camera: Array, point: Array) -> State:
+        s = self.state
+        pose = camera[: self._lens].reshape(-1, 6)
+        turn = _exponential(-pose[:, :3])
+        bearing = s.bearing + np.einsum("nij,nj->ni", _tangent_basis(s.bearing), point[:, :2])
+        length = np.linalg.norm(bearing, axis=1)
+        affine = camera[self._affine : self._field].reshape(-1, 2)
+        return State(
+            rotation=turn @ s.rotation,
+            translation=np.einsum("nij,nj->ni", turn, s.translation - pose[:, 3:]),
+            bearing=bearing / length[:, None],
+            inverse_distance=(s.inverse_distance + point[:, 2]) / length,
+            log_focal=s.log_focal + float(camera[self._lens]),
+            scale=s.scale + affine[:, 0],
+            shift=s.shift + affine[:, 1],
+            field=s.field + camera[self._field :],
+        )
+
+    def solve(self, iterations: int | None = None) -> State:
+        """Minimise; the result is also `self.state`."""
+        damping = _FIRST_DAMPING
+        cost = self._cost(self.state)
+        for _ in range(iterations or self.options.iterations):
+            normal = self._linearize()
+            blocks = self._cross_blocks(normal)
+            while damping < _LARGEST_DAMPING:
+                candidate = self._retract(*self._step(normal, blocks, damping))
+                new_cost = self._cost(candidate)
+                if new_cost < cost:
+                    break
+                damping *= 8.0
+            else:
+                break
+            self.iterations += 1
+            decrease = (cost - new_cost) / cost
+            self.state, cost = candidate, new_cost
+            damping = max(damping / 5.0, 1e-9)
+            if decrease < self.options.tolerance:
+                break
+        return self.state
+
+    # --- uncertainty --------------------------------------------------------------------------------------------
+
+    def covariance(self, points: Index) -> tuple[Array, Array]:
+        """Joint covariance of the camera side, and of the inverse distances of some points.
+
+        Returns:
+            (c, c) over the columns (six per frame in GTSAM's pose convention, log focal, scale and shift per image,
+            field), zero where a column is fixed; (p, p) of the inverse distances of `points`.
+        """
+        normal = self._linearize()
+        blocks = self._cross_blocks(normal)
+        information, _, point_covariance = self._reduced(normal, blocks, 0.0)
+        free = self._free
+        camera = np.zeros((self._columns, self._columns))
+        camera[np.ix_(free, free)] = np.linalg.inv(_conditioned(information[np.ix_(free, free)]))
+        gain = np.zeros((len(points), self._columns))
+        for cross, columns, span in blocks:
+            inside = np.nonzero((points >= span.start) & (points < span.stop))[0]
+            local = points[inside] - span.start
+            picked = cross.reshape(len(columns), -1, 3)[:, local]
+            gain[np.ix_(inside, columns)] = np.einsum("cpi,pi->pc", picked, point_covariance[points[inside], 2])
+        joint = gain @ camera @ gain.T
+        joint[np.diag_indices_from(joint)] += point_covariance[points, 2, 2]
+        return camera, joint
+
+
+def _conditioned(information: Array) -> Array:
+    """The matrix with a ridge far below any information that matters."""
+    return np.asarray(information + np.diag(1e-12 * np.maximum(information.diagonal(), 1e-300)))
+
+
+def _tangent_basis(bearing: Array) -> Array:
+    """(n, 3, 2) orthonormal basis of the plane perpendicular to each unit vector."""
+    axis = np.where(np.abs(bearing[:, :1]) < 0.7, np.array([[1.0, 0.0, 0.0]]), np.array([[0.0, 1.0, 0.0]]))
+    first = np.cross(bearing, axis)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([first, np.cross(bearing, first)], -1)
+
+
+def _exponential(rotation_vector: Array) -> Array:
+    """(n, 3, 3) rotation matrices of (n, 3) rotation vectors."""
+    angle = np.linalg.norm(rotation_vector, axis=1)[:, None, None]
+    x, y, z = rotation_vector.T
+    zero = np.zeros_like(x)
+    hat = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
+    safe = np.maximum(angle, 1e-8)
+    half = np.sinc(angle / 2.0 / np.pi) ** 2 / 2.0
+    return np.asarray(np.eye(3) + np.sin(safe) / safe * hat + half * (hat @ hat))

@@ -1,0 +1,211 @@
+"""Registration of one image on the map: PnP, then robust refinement, with the depth prior where it is asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from factorsfm.factors import (
+    camera_from_pose,
+    camera_points,
+    image_depth_factor,
+    image_reprojection_factor,
+    pose_from_camera,
+    reprojection,
+)
+
+Array = NDArray[np.float64]
+
+_POSE = gtsam.symbol("x", 0)
+_AFFINE = gtsam.symbol("a", 0)
+_KERNEL = 2.0  # Cauchy scale in standard deviations
+_DEPTH_FLOOR = 0.03  # smallest believable relative error of a depth network
+
+
+@dataclass(frozen=True, slots=True)
+class ImageDepth:
+    """Depth prior at the keypoints of one image, NaN where it is invalid.
+
+    Attributes:
+        inverse_depth: (n,) in units of the map's median; `unit` times this is the map's own unit.
+        reliability: (n,) in [0, 1], low on depth edges.
+        unit: factor to the unit of the prior's map.
+    """
+
+    inverse_depth: Array
+    reliability: Array
+    unit: float
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        return np.isfinite(self.inverse_depth) & (self.reliability > 0.5) & (self.inverse_depth > 0.02)
+
+
+@dataclass(frozen=True, slots=True)
+class Registration:
+    """Pose of an image on the map.
+
+    Attributes:
+        rotation, translation: `cam_from_world`.
+        inliers: (n,) which correspondences the pose explains.
+        error: median reprojection error of the inliers (pixels).
+        threshold: reprojection error up to which a correspondence is an inlier (pixels).
+        affine: scale and shift (or gamma and beta) where depth took part.
+    """
+
+    rotation: Array
+    translation: Array
+    inliers: NDArray[np.bool_]
+    error: float
+    threshold: float
+    affine: tuple[float, float] | None = None
+
+
+def fit_affine(inverse_depth: Array, measured: Array) -> tuple[float, float, float]:
+    """Robust scale and shift with ``scale * inverse_depth + shift ~ measured``, and the spread of the residuals.
+
+    The scale is kept positive: a mirrored prior is no prior.
+    """
+    design = np.stack([inverse_depth, np.ones_like(inverse_depth)], -1)
+    center = max(float(np.median(inverse_depth)), 1e-9)
+    # A weak prior (shift 0, scale from the medians) settles what the spread of the depths leaves open.
+    first = np.array([float(np.median(measured)) / center, 0.0])
+    prior = np.diag([1.0 / first[0] ** 2, 4.0 / max(float(np.median(measured)), 1e-9) ** 2])
+    solution = first
+    weight = np.ones_like(measured)
+    spread = 1.0
+    for _ in range(8):
+        residual = design @ solution - measured
+        spread = max(1.4826 * float(np.median(np.abs(residual))), 1e-6)
+        weight = 1.0 / (1.0 + (residual / (_KERNEL * spread)) ** 2)
+        normal = design.T @ (design * weight[:, None]) / spread**2
+        solution = np.linalg.solve(normal + prior, design.T @ (weight * measured) / spread**2 + prior @ first)
+    if solution[0] < 0.05 * first[0]:
+        solution = np.array([0.05 * first[0], float(np.median(measured)) - 0.05 * float(np.median(measured))])
+    return float(solution[0]), float(solution[1]), spread
+
+
+def register_image(
+    points: Array,
+    observed: Array,
+    rotation: Array,
+    translation: Array,
+    *,
+    focal: float,
+    sigma: float,
+    inlier_px: float,
+    depth: ImageDepth | None = None,
+    domain: Literal["inverse", "depth"] = "inverse",
+    depth_weight: float = 1.0,
+) -> Registration:
+    """Pose of an image from 3-D points, started at a nearby pose, or by PnP-RANSAC where that start fails.
+
+    Paper, section 3.2: ``min over R, t, gamma, beta of sum E_PR + lambda E_DC`` with the points fixed.
+
+    Args:
+        points: (n, 3) world coordinates; observed: (n, 2) normalised; rotation, translation: first guess.
+        focal: pixels; sigma: noise of a keypoint (pixels); inlier_px: see `MapperOptions`.
+        depth: prior at the same n keypoints; with ``domain="depth"`` the paper's residual with lambda `depth_weight`.
+    """
+    result = _refine(points, observed, rotation, translation, focal, sigma, inlier_px)
+    if result.inliers.mean() < 0.6 and len(points) >= 6:
+        start = _pnp_ransac(points, observed, focal, max(inlier_px, 2.0))
+        if start is not None:
+            other = _refine(points, observed, *start, focal, sigma, inlier_px)
+            if other.inliers.sum() > result.inliers.sum():
+                result = other
+    if depth is None or not (use := result.inliers & depth.valid).sum() >= 10:
+        return result
+    return _refine_with_depth(result, points, observed, use, focal, sigma, depth, domain, depth_weight)
+
+
+def _residuals(points: Array, observed: Array, rotation: Array, translation: Array, focal: float) -> Array:
+    q = camera_points(rotation, translation, points, np.ones(len(points)))
+    error = np.full(len(points), np.inf)
+    front = q[:, 2] > 1e-6
+    error[front] = np.linalg.norm(reprojection(q[front], observed[front], focal)[0], axis=1)
+    return error
+
+
+def _optimize(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setMaxIterations(20)
+    parameters.setRelativeErrorTol(1e-6)
+    return gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
+
+
+def _refine(
+    points: Array, observed: Array, rotation: Array, translation: Array, focal: float, sigma: float, inlier_px: float
+) -> Registration:
+    """Robust pose; the kernel follows the spread of the residuals, since a young map is not yet exact."""
+    error = _residuals(points, observed, rotation, translation, focal)
+    for _ in range(2):
+        finite = error[np.isfinite(error)]
+        spread = max(sigma, float(np.median(finite)) if len(finite) else sigma)
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        graph.add(image_reprojection_factor(_POSE, points, observed, focal, spread, _KERNEL))
+        values.insert(_POSE, pose_from_camera(rotation, translation))
+        rotation, translation = camera_from_pose(_optimize(graph, values).atPose3(_POSE))
+        error = _residuals(points, observed, rotation, translation, focal)
+    finite = error[np.isfinite(error)]
+    median = float(np.median(finite)) if len(finite) else float("inf")
+    threshold = max(inlier_px, min(4.0 * median, 8.0 * inlier_px))
+    inliers = error < threshold
+    typical = float(np.median(error[inliers])) if inliers.any() else float("inf")
+    return Registration(rotation, translation, inliers, typical, threshold)
+
+
+def _pnp_ransac(points: Array, observed: Array, focal: float, threshold_px: float) -> tuple[Array, Array] | None:
+    """SQPnP in RANSAC (the iterative default of OpenCV 5 fails on some planar scenes)."""
+    found, vector, translation, _ = cv2.solvePnPRansac(
+        points, observed, np.eye(3), None,
+        iterationsCount=300, reprojectionError=threshold_px / focal, confidence=0.999, flags=cv2.SOLVEPNP_SQPNP,
+    )  # fmt: skip
+    if not found or not np.isfinite(vector).all() or not np.isfinite(translation).all():
+        return None
+    return cv2.Rodrigues(vector)[0], translation.ravel()
+
+
+def _refine_with_depth(
+    result: Registration,
+    points: Array,
+    observed: Array,
+    use: NDArray[np.bool_],
+    focal: float,
+    sigma: float,
+    depth: ImageDepth,
+    domain: Literal["inverse", "depth"],
+    depth_weight: float,
+) -> Registration:
+    q = camera_points(result.rotation, result.translation, points[use], np.ones(int(use.sum())))
+    measured = depth.inverse_depth[use]
+    if domain == "inverse":
+        scale, shift, spread = fit_affine(1.0 / q[:, 2], measured)
+        # All keypoints together count as one measurement per cell of correlated error (see `prior_weight`).
+        depth_sigma = np.full(len(measured), max(spread, _DEPTH_FLOOR) * np.sqrt(max(1.0, len(measured) / 100.0)))
+    else:
+        measured = 1.0 / measured
+        scale, shift, _ = fit_affine(measured, q[:, 2])
+        depth_sigma = np.full(len(measured), 1.0 / np.sqrt(depth_weight))
+        sigma = 1.0  # the paper weighs pixels by one
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    inliers = result.inliers
+    graph.add(image_reprojection_factor(_POSE, points[inliers], observed[inliers], focal, sigma, _KERNEL))
+    graph.add(image_depth_factor(_POSE, _AFFINE, points[use], measured, depth_sigma, _KERNEL, domain=domain))
+    values.insert(_POSE, pose_from_camera(result.rotation, result.translation))
+    values.insert(_AFFINE, np.array([scale, shift]))
+    solution = _optimize(graph, values)
+    rotation, translation = camera_from_pose(solution.atPose3(_POSE))
+    scale, shift = solution.atVector(_AFFINE)
+    error = _residuals(points, observed, rotation, translation, focal)
+    inliers = error < result.threshold
+    if inliers.sum() < 0.8 * result.inliers.sum():
+        return result
+    return Registration(
+        rotation, translation, inliers, float(np.median(error[inliers])), result.threshold, (float(scale), float(shift))
+    )

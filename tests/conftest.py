@@ -1,0 +1,27 @@
+"""Fixtures shared by all tests."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+SHARED = Path(os.environ.get("FACTORSFM_SHARED", Path(__file__).resolve().parents[2] / "shared"))
+
+
+def _shared(folder: str) -> Path:
+    path = SHARED / folder
+    if not path.is_dir():
+        pytest.skip(f"development {folder} not found at {path} (set FACTORSFM_SHARED)")
+    return path
+
+
+@pytest.fixture
+def shared_data() -> Path:
+    """Folder with the development shots; skips the test where it is absent."""
+    return _shared("data")
+
+
+@pytest.fixture
+def shared_models() -> Path:
+    """Folder with the development networks; skips the test where it is absent."""
+    return _shared("models")
