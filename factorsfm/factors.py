@@ -45,10 +45,10 @@ def d_camera_points_d_pose(q: Array, w: Array) -> Array:
 
 
 def reprojection(q: Array, observed: Array, focal: float) -> tuple[Array, Array]:
-    """``f (q_xy / q_z - observed)``, the paper's E_PR with undistorted normalised observations.
+    """``f q_xy / q_z - observed``, the paper's E_PR with undistorted observations.
 
     Args:
-        q: (n, 3); observed: (n, 2) normalised image coordinates; focal: pixels.
+        q: (n, 3); observed: (n, 2) pixels relative to the principal point; focal: pixels.
 
     Returns:
         Residual (n, 2) in pixels and its derivative by `q` (n, 2, 3).
@@ -58,7 +58,7 @@ def reprojection(q: Array, observed: Array, focal: float) -> tuple[Array, Array]
     by_q = np.zeros((len(q), 2, 3))
     by_q[:, 0, 0] = by_q[:, 1, 1] = focal * inverse
     by_q[:, :, 2] = -focal * projected * inverse[:, None]
-    return focal * (projected - observed), by_q
+    return focal * projected - observed, by_q
 
 
 def affine_inverse_depth(
@@ -142,13 +142,19 @@ def pose_from_camera(rotation: Array, translation: Array) -> gtsam.Pose3:
 def image_reprojection_factor(
     pose_key: int, points: Array, observed: Array, focal: float, sigma: float, kernel: float
 ) -> gtsam.CustomFactor:
-    """All reprojections of one image on its pose, the points held fixed; Cauchy kernel per observation."""
+    """All reprojections of one image on its pose, the points held fixed; Cauchy kernel per observation.
+
+    Args:
+        points: (n, 3); observed: (n, 2) undistorted normalised coordinates; focal, sigma: pixels.
+        kernel: Cauchy scale in standard deviations.
+    """
     w = np.ones(len(points))
+    pixels = focal * observed
 
     def function(values: gtsam.Values) -> tuple[Array, list[Array]]:
         q = camera_points(*camera_from_pose(values.atPose3(pose_key)), points, w)
         q[:, 2] = np.maximum(q[:, 2], 1e-6)
-        residual, by_q = reprojection(q, observed, focal)
+        residual, by_q = reprojection(q, pixels, focal)
         by_pose = by_q @ d_camera_points_d_pose(q, w) / sigma
         return _robust_rows(residual / sigma, [by_pose], kernel)
 

@@ -62,6 +62,8 @@ class FrameResult:
         observations, inliers: tracked points in the frame, and those that the final model explains.
         reprojection_error: median over the inliers (pixels), NaN where not registered.
         prior: fitted scale and shift of the depth prior, None where the frame carries none.
+        covariance: (6, 6) of (rotation vector, translation), a perturbation of `world_from_cam` on the right; None
+            where not registered.
     """
 
     index: int
@@ -75,6 +77,7 @@ class FrameResult:
     inliers: int = 0
     reprojection_error: float = float("nan")
     prior: PriorFit | None = None
+    covariance: NDArray[np.float64] | None = None
 
     @property
     def registered(self) -> bool:

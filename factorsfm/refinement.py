@@ -151,6 +151,7 @@ class BundleAdjustment:
         self.prior = prior
         self.iterations = 0
         self._anchor = state.inverse_distance.copy()
+        self._pixels = observations.xy * np.exp(state.log_focal)  # what was measured, whatever the focal length
         frames, images, nodes = len(state.rotation), len(state.scale), len(state.field)
         self._lens = 6 * frames
         self._affine = self._lens + 1
@@ -169,14 +170,22 @@ class BundleAdjustment:
 
     def reprojection_errors(self) -> Array:
         """(m,) distance between observed and predicted position (pixels)."""
-        return np.asarray(np.linalg.norm(self._reprojection(self.state)[0], axis=1) * self.sigma)
+        return np.asarray(np.linalg.norm(self.reprojection_vectors(), axis=1))
+
+    def reprojection_vectors(self) -> Array:
+        """(m, 2) predicted minus observed position (pixels)."""
+        return self._reprojection(self.state)[0] * self.sigma
+
+    def cost(self) -> float:
+        """Robust cost at the present state."""
+        return self._cost(self.state)
 
     def _reprojection(self, state: State) -> tuple[Array, Array, Array]:
         o = self.observations
         q = state.camera_points(o.frame, o.point)
         behind = q[:, 2] <= 1e-6
         q[behind, 2] = 1e-6
-        residual, by_q = reprojection(q, o.xy, np.exp(state.log_focal))
+        residual, by_q = reprojection(q, self._pixels, np.exp(state.log_focal))
         by_q[behind] = 0.0
         return residual / self.sigma, by_q / self.sigma, q
 

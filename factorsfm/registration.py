@@ -35,11 +35,13 @@ class ImageDepth:
         inverse_depth: (n,) in units of the map's median; `unit` times this is the map's own unit.
         reliability: (n,) in [0, 1], low on depth edges.
         unit: factor to the unit of the prior's map.
+        free_shift: whether the inverse depth is known up to a shift only (relative networks).
     """
 
     inverse_depth: Array
     reliability: Array
     unit: float
+    free_shift: bool = True
 
     @property
     def valid(self) -> NDArray[np.bool_]:
@@ -66,7 +68,7 @@ class Registration:
     affine: tuple[float, float] | None = None
 
 
-def fit_affine(inverse_depth: Array, measured: Array) -> tuple[float, float, float]:
+def fit_affine(inverse_depth: Array, measured: Array, *, free_shift: bool = True) -> tuple[float, float, float]:
     """Robust scale and shift with ``scale * inverse_depth + shift ~ measured``, and the spread of the residuals.
 
     The scale is kept positive: a mirrored prior is no prior.
@@ -75,7 +77,8 @@ def fit_affine(inverse_depth: Array, measured: Array) -> tuple[float, float, flo
     center = max(float(np.median(inverse_depth)), 1e-9)
     # A weak prior (shift 0, scale from the medians) settles what the spread of the depths leaves open.
     first = np.array([float(np.median(measured)) / center, 0.0])
-    prior = np.diag([1.0 / first[0] ** 2, 4.0 / max(float(np.median(measured)), 1e-9) ** 2])
+    shift_sigma = (0.5 if free_shift else 0.02) * max(float(np.median(measured)), 1e-9)
+    prior = np.diag([first[0] ** -2.0, shift_sigma**-2.0])
     solution = first
     weight = np.ones_like(measured)
     spread = 1.0
@@ -128,7 +131,7 @@ def _residuals(points: Array, observed: Array, rotation: Array, translation: Arr
     q = camera_points(rotation, translation, points, np.ones(len(points)))
     error = np.full(len(points), np.inf)
     front = q[:, 2] > 1e-6
-    error[front] = np.linalg.norm(reprojection(q[front], observed[front], focal)[0], axis=1)
+    error[front] = np.linalg.norm(reprojection(q[front], focal * observed[front], focal)[0], axis=1)
     return error
 
 

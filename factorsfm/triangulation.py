@@ -118,5 +118,5 @@ def _support(
     q = camera_points(rotation[o.frame], translation[o.frame], points[o.point, :3], points[o.point, 3])
     front = (q[:, 2] > 1e-9) & (points[o.point, 3] > 0.0)
     error = np.full(len(q), 10.0 * limit)
-    error[front] = np.linalg.norm(reprojection(q[front], o.xy[front], focal)[0], axis=1)
+    error[front] = np.linalg.norm(reprojection(q[front], focal * o.xy[front], focal)[0], axis=1)
     return error

@@ -1,0 +1,111 @@
+"""How far a depth prior can be trusted, measured on the shot itself.
+
+The errors of a network are smooth over the image and alike from frame to frame, so that hundreds of keypoints on ten
+keyframes are a handful of independent measurements. The error of the prior is modelled as
+
+    ``d = a (1 / z + e(direction) + n) + b``,
+
+with a smooth field ``e`` that belongs to the scene (shared by all images, exponential correlation over the viewing
+direction) and a local rest ``n``. Their sizes maximise the likelihood of the differences between the prior and the
+geometry, whose own joint covariance is known: where geometry is precise the differences show the network's error,
+where it is silent they say nothing and are not mistaken for precision.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+_SMOOTH = np.geomspace(0.02, 1.5, 9)  # candidate standard deviations, in units of the median inverse depth
+_LOCAL = np.geomspace(0.01, 0.6, 8)
+_LENGTHS = (0.15, 0.5)  # candidate correlation lengths, in units of the extent of the scene's directions
+_SAMPLE = 200  # points on which the likelihood is evaluated
+_NODES = (12, 7)  # nodes of the field across and down
+
+
+@dataclass(frozen=True, slots=True)
+class PriorWeight:
+    """Error model of the prior of one shot, in units of the scene's median inverse depth.
+
+    Attributes:
+        smooth: standard deviation of the smooth field.
+        local: standard deviation of the independent rest of a point.
+        length: correlation length of the field, radians.
+        correlation: of the prior with the reconstructed inverse depth, after scale and shift.
+    """
+
+    smooth: float
+    local: float
+    length: float
+    correlation: float
+
+
+def direction_angles(bearing: Array) -> Array:
+    """(n, 2) azimuth and elevation of unit vectors (radians)."""
+    return np.stack([np.arctan2(bearing[:, 0], bearing[:, 2]), np.arcsin(np.clip(bearing[:, 1], -1.0, 1.0))], -1)
+
+
+def sample_points(count: int, seed: int = 0) -> Index:
+    """Rows of the points on which a weight is measured."""
+    rng = np.random.default_rng(seed)
+    return np.sort(rng.permutation(count)[:_SAMPLE])
+
+
+def measure_weight(angles: Array, inverse_depth: Array, prior: Array, covariance: Array) -> PriorWeight:
+    """Maximum-likelihood error model from the points of a shot.
+
+    Args:
+        angles: (n, 2) directions; inverse_depth: (n,) from geometry, median about 1.
+        prior: (n,) inverse depth that the prior says, after scale and shift, averaged over the images.
+        covariance: (n, n) of `inverse_depth`.
+    """
+    difference = prior - inverse_depth
+    difference = difference - np.median(difference)
+    spread = max(1.4826 * float(np.median(np.abs(difference))), 1e-6)
+    difference = np.clip(difference, -4.0 * spread, 4.0 * spread)
+    distance = np.linalg.norm(angles[:, None] - angles[None], axis=2)
+    extent = float(np.ptp(angles, axis=0).max())
+    # Scale and shift of the prior are free: directions of the data space that carry no information.
+    free = np.stack([inverse_depth - np.mean(inverse_depth), np.ones_like(inverse_depth)], -1)
+    nuisance = 4.0 * free @ free.T
+    best, best_score = (float(_SMOOTH[-1]), float(_LOCAL[-1]), _LENGTHS[0] * extent), -np.inf
+    for share in _LENGTHS:
+        kernel = np.exp(-distance / (share * extent))
+        for smooth, local in product(_SMOOTH, _LOCAL):
+            total = covariance + nuisance + smooth**2 * kernel
+            total[np.diag_indices_from(total)] += local**2
+            root = np.linalg.cholesky(total)
+            white = np.linalg.solve(root, difference)
+            score = -0.5 * float(white @ white) - float(np.log(root.diagonal()).sum())
+            if score > best_score:
+                best, best_score = (float(smooth), float(local), share * extent), score
+    certain = covariance.diagonal() < np.median(covariance.diagonal()) * 4.0
+    correlation = float(np.corrcoef(prior[certain], inverse_depth[certain])[0, 1]) if certain.sum() > 2 else 0.0
+    return PriorWeight(*best, correlation)
+
+
+def field_grid(angles: Array, weight: PriorWeight) -> tuple[Index, Array, Array]:
+    """Nodes of the smooth field under a set of directions.
+
+    Returns:
+        Node indices (n, 4), bilinear weights (n, 4), and the information matrix of the nodes.
+    """
+    columns, rows = _NODES
+    low, high = angles.min(0), angles.max(0)
+    step = np.maximum(high - low, 1e-6) / [columns - 1, rows - 1]
+    position = (angles - low) / step
+    cell = np.minimum(position.astype(np.int64), [columns - 2, rows - 2])
+    x, y = (position - cell).T
+    corner = cell[:, 1] * columns + cell[:, 0]
+    nodes = corner[:, None] + np.array([0, 1, columns, columns + 1])
+    weights = np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], -1)
+    grid = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), -1).reshape(-1, 2) * step
+    distance = np.linalg.norm(grid[:, None] - grid[None], axis=2)
+    covariance = weight.smooth**2 * (np.exp(-distance / weight.length) + 1e-6 * np.eye(len(grid)))
+    return nodes, weights, np.linalg.inv(covariance)

@@ -1,0 +1,207 @@
+"""Assembly of the public result from the polish."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from factorsfm.mapper import MappedImage
+from factorsfm.polish import Polished
+from factorsfm.reconstruction import FrameResult, FrameStatus, PriorFit, Reconstruction, ShotKind
+from factorsfm.refinement import State
+
+Array = NDArray[np.float64]
+
+
+class SeenFrame(Protocol):
+    """What the result needs to know of a frame."""
+
+    @property
+    def index(self) -> int: ...
+    @property
+    def name(self) -> str: ...
+    @property
+    def timestamp(self) -> float | None: ...
+
+
+def assemble(
+    polished: Polished,
+    images: list[MappedImage],
+    frames: Sequence[SeenFrame],
+    pixels: list[Array],
+    colors: NDArray[np.uint8],
+    camera: pycolmap.Camera,
+    *,
+    metric: bool,
+    focal_guessed: bool,
+    seconds: dict[str, float],
+    options: dict[str, Any],
+) -> Reconstruction:
+    """The public result.
+
+    Args:
+        pixels: keypoints (pixels, centres at integers) of each frame, in the order of its track ids.
+        colors: RGB by track id.
+        metric: whether the prior's unit is the metre.
+    """
+    state, notes = polished.state, _notes(polished, focal_guessed)
+    scale = _metric_scale(polished, images) if metric else None
+    unit = scale or 1.0
+    if focal_guessed:
+        camera = _with_focal(camera, float(np.exp(state.log_focal)))
+    kept, row_of = _usable_points(polished)
+    observations = polished.observations
+    keep = row_of[observations.point] >= 0
+    frame, point = observations.frame[keep], observations.point[keep]
+    positions = np.array(polished.frames)
+    xy = np.empty((len(frame), 2))
+    for k in np.unique(frame):
+        mine = frame == k
+        ids = images[positions[k]].tracks.ids
+        xy[mine] = pixels[positions[k]][np.searchsorted(ids, polished.tracks[point[mine]])]
+    points = state.bearing[kept] / state.inverse_distance[kept, None] * unit
+    prior_residual = np.full(len(observations.point), np.nan)
+    if polished.prior is not None:
+        p = polished.prior
+        order = np.lexsort((p.observations.frame, p.observations.point))
+        key = observations.point * (len(positions) + 1) + observations.frame
+        at = np.searchsorted(key, (p.observations.point * (len(positions) + 1) + p.observations.frame)[order])
+        predicted = p.residual + p.observations.inverse_depth - state.shift[p.observations.image]
+        prior_residual[at] = (p.residual / np.maximum(np.abs(predicted), 1e-6))[order]
+    result = Reconstruction(
+        camera=camera,
+        frames=_frame_results(polished, images, frames, unit),
+        points=points,
+        colors=colors[polished.tracks[kept]],
+        track_ids=polished.tracks[kept],
+        observation_frame=positions[frame],
+        observation_point=row_of[point],
+        observation_xy=xy,
+        observation_error=polished.errors[keep],
+        prior_residual=prior_residual[keep],
+        kind=polished.motion.kind,
+        parallax=_parallax(state),
+        metric=scale is not None,
+        notes=notes,
+        seconds=seconds,
+        options=options,
+    )
+    return result
+
+
+def _usable_points(polished: Polished) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
+    """Points at a positive, not absurd distance; and the new row of each, -1 where it is left out."""
+    inverse = polished.state.inverse_distance
+    q = polished.state.camera_points(polished.observations.frame, polished.observations.point)
+    nearest = np.full(len(inverse), np.inf)
+    np.minimum.at(nearest, polished.observations.point, q[:, 2])
+    kept = np.nonzero((inverse > 1e-3) & (nearest > 1e-6))[0]
+    row_of = np.full(len(inverse), -1)
+    row_of[kept] = np.arange(len(kept))
+    return kept, row_of
+
+
+def _parallax(state: State) -> float:
+    """Largest camera displacement over the median point depth."""
+    centers = -np.einsum("kji,kj->ki", state.rotation, state.translation)
+    depth = 1.0 / np.maximum(np.median(state.inverse_distance), 1e-9)
+    return float(np.linalg.norm(centers - centers[0], axis=1).max() / depth)
+
+
+def _metric_scale(polished: Polished, images: list[MappedImage]) -> float | None:
+    """Metres per world unit: a metric prior says ``1 / metres``, the state ``scale / z``."""
+    if polished.prior is None:
+        return None
+    units = [images[polished.frames[r]].tracks.depth.unit for r in polished.prior.images]  # type: ignore[union-attr]
+    return 1.0 / float(np.median(polished.state.scale * np.array(units)))
+
+
+def _with_focal(camera: pycolmap.Camera, focal: float) -> pycolmap.Camera:
+    estimated = pycolmap.Camera(camera.todict())
+    ratio = focal / (0.5 * (camera.focal_length_x + camera.focal_length_y))
+    for index in camera.focal_length_idxs():
+        params = estimated.params
+        params[index] *= ratio
+        estimated.params = params
+    return estimated
+
+
+def _frame_results(
+    polished: Polished, images: list[MappedImage], frames: Sequence[SeenFrame], unit: float
+) -> list[FrameResult]:
+    state, o = polished.state, polished.observations
+    threshold = 4.0 * polished.sigma * 2.0
+    seen = np.bincount(o.frame, minlength=len(polished.frames))
+    inliers = np.bincount(o.frame, polished.errors < threshold, len(polished.frames)).astype(int)
+    error = np.array([float(np.median(polished.errors[o.frame == k])) if n else np.nan for k, n in enumerate(seen)])
+    results = []
+    row_of = {position: row for row, position in enumerate(polished.frames)}
+    prior = _prior_fits(polished, images)
+    for position, (frame, image) in enumerate(zip(frames, images, strict=True)):
+        result = FrameResult(
+            frame.index, frame.name, frame.timestamp, image.status, image.message,
+            keyframe=image.keyframe, observations=len(image.tracks.ids),
+        )  # fmt: skip
+        row = row_of.get(position)
+        if row is not None:
+            result.cam_from_world = pycolmap.Rigid3d(
+                pycolmap.Rotation3d(state.rotation[row]), state.translation[row] * unit
+            )
+            result.inliers = int(inliers[row])
+            result.reprojection_error = float(error[row])
+            result.prior = prior.get(row)
+            covariance = polished.covariance[row].copy()
+            covariance[3:] *= unit
+            covariance[:, 3:] *= unit
+            result.covariance = covariance
+            result.message = f"{result.inliers} of {seen[row]} tracks within {threshold:.2f} pixels"
+            if polished.motion.kind is ShotKind.STATIC:
+                result.status = FrameStatus.STATIC
+                result.message += "; the camera does not move"
+        results.append(result)
+    return results
+
+
+def _prior_fits(polished: Polished, images: list[MappedImage]) -> dict[int, PriorFit]:
+    if (p := polished.prior) is None:
+        return {}
+    fits = {}
+    for i, row in enumerate(p.images.tolist()):
+        depth = images[polished.frames[row]].tracks.depth
+        assert depth is not None
+        residual = p.residual[p.observations.image == i]
+        fits[row] = PriorFit(
+            scale=float(polished.state.scale[i]) * depth.unit,
+            shift=float(polished.state.shift[i]) * depth.unit,
+            scale_std=float(p.scale_std[i]) * depth.unit,
+            shift_std=float(p.shift_std[i]) * depth.unit,
+            sigma=1.4826 * float(np.median(np.abs(residual))) * depth.unit,
+        )
+    return fits
+
+
+def _notes(polished: Polished, focal_guessed: bool) -> list[str]:
+    notes, motion = list(polished.notes), polished.motion
+    if motion.kind is ShotKind.STATIC:
+        notes.append(
+            f"The camera is static: no frame moves by more than {motion.displacement_px:.2f} pixels; "
+            "depths come from the prior alone."
+        )
+    elif motion.kind is ShotKind.ROTATION:
+        notes.append(
+            "The camera only rotates: its translation is not observable from geometry and is reported as zero; "
+            "depths and their scale come from the prior alone."
+        )
+    if focal_guessed:
+        focal, std = float(np.exp(polished.state.log_focal)), polished.focal_std
+        if std is not None and std <= 0.05:
+            notes.append(f"The focal length was estimated: {focal:.0f} pixels, standard deviation {100 * std:.1f} %.")
+        else:
+            notes.append(f"The focal length is a guess ({focal:.0f} pixels): this shot does not determine it.")
+    return notes
+
+

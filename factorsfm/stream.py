@@ -1,0 +1,222 @@
+"""Frames in, poses out: the tracker, the priors and the mapper joined; `finish` polishes over all frames."""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from factorsfm.camera import check_camera, guess_camera, normalized_from_pixels
+from factorsfm.errors import InputError, ReconstructionError
+from factorsfm.frames import Frame
+from factorsfm.initialization import ImageTracks
+from factorsfm.mapper import MappedImage, Mapper
+from factorsfm.options import Options
+from factorsfm.polish import polish
+from factorsfm.priors.depth import DepthKind, DepthPrior
+from factorsfm.priors.masks import MaskPrior
+from factorsfm.reconstruction import FrameStatus, Reconstruction
+from factorsfm.registration import ImageDepth
+from factorsfm.result import assemble
+from factorsfm.tracks.flow import FlowTracker
+
+_BLANK_TEXTURE = 1.0  # grey levels; below this an image is black, white or out of focus
+
+
+@dataclass(frozen=True, slots=True)
+class FrameUpdate:
+    """What is known of a frame right after it was pushed.
+
+    Attributes:
+        index: of the frame; status, message: see `FrameResult`.
+        cam_from_world: pose now, causal; None where the frame is not registered.
+        keyframe: whether it entered the graph.
+        tracks, inliers: tracked points, and those that agree with the pose.
+    """
+
+    index: int
+    status: FrameStatus
+    message: str
+    cam_from_world: pycolmap.Rigid3d | None
+    keyframe: bool
+    tracks: int
+    inliers: int
+
+
+@dataclass(frozen=True, slots=True)
+class SeenFrame:
+    """What is kept of a frame: never its pixels."""
+
+    index: int
+    name: str
+    timestamp: float | None
+
+
+class Stream:
+    """Incremental reconstruction of one shot.
+
+    Args:
+        camera: the lens; None guesses a field of view at the first frame and refines it in `finish`.
+        depth: prior, or None.
+        masks: what to ignore, or None.
+        options: see `Options`; None is the default preset.
+
+    Example:
+        >>> stream = factorsfm.Stream(camera, depth=factorsfm.DepthModel("model.onnx"))  # doctest: +SKIP
+        >>> for frame in factorsfm.read_frames("shot.mp4"):  # doctest: +SKIP
+        ...     update = stream.push(frame)
+        >>> reconstruction = stream.finish()  # doctest: +SKIP
+    """
+
+    def __init__(
+        self,
+        camera: pycolmap.Camera | None = None,
+        *,
+        depth: DepthPrior | None = None,
+        masks: MaskPrior | None = None,
+        options: Options | None = None,
+    ) -> None:
+        self.camera = camera
+        self.options = options or Options()
+        self.seconds: dict[str, float] = defaultdict(float)
+        self.frames: list[SeenFrame] = []
+        self._depth = depth if self.options.uses_depth else None
+        self._masks = masks
+        self._tracker = FlowTracker(self.options.tracker)
+        self._mapper: Mapper | None = None
+        self._size = (0, 0)
+        self._colors = np.zeros((0, 3), np.uint8)
+        self._pixels: list[NDArray[np.float64]] = []
+        self._focal_guessed = False
+
+    def push(self, frame: Frame | NDArray[np.uint8]) -> FrameUpdate:
+        """Take the next frame.
+
+        Args:
+            frame: a `Frame`, or an image (h, w, 3) BGR or (h, w) grey, 8 bits.
+
+        Raises:
+            InputError: its size differs from that of the frames before, or contradicts the camera.
+        """
+        if not isinstance(frame, Frame):
+            frame = Frame(len(self.frames), frame, f"{len(self.frames):06d}", None)
+        mapper = self._mapper or self._open(frame)
+        if frame.image.shape[1::-1] != self._size:
+            raise InputError(
+                f"frame {frame.index} is {frame.image.shape[1]}x{frame.image.shape[0]}, "
+                f"expected {self._size[0]}x{self._size[1]} as the frames before"
+            )
+        with self._timed("masks"):
+            mask = self._masks(frame) if self._masks is not None else None
+        with self._timed("tracking"):
+            tracked = self._tracker.track(frame.image, mask)
+        self._remember_colors(frame.image, tracked.ids, tracked.xy)
+        xy = normalized_from_pixels(self.camera, tracked.xy)
+        tracks = ImageTracks(len(self.frames), tracked.ids, xy)
+        self.frames.append(SeenFrame(frame.index, frame.name, frame.timestamp))
+        self._pixels.append(tracked.xy)
+        with self._timed("mapping"):
+            image = mapper.add(tracks, lambda: self._read_depth(frame, tracked.xy))
+        if tracked.texture < _BLANK_TEXTURE and not image.registered:
+            image.status = FrameStatus.BLANK
+            image.message = f"contrast {tracked.texture:.1f} of {_BLANK_TEXTURE:.1f} needed grey levels"
+        return _update(frame.index, image)
+
+    def finish(self, progress: Callable[[str, int, int | None], None] | None = None) -> Reconstruction:
+        """Polish over all frames and tracks.
+
+        Raises:
+            ReconstructionError: no frame could be registered, or too few points remain.
+        """
+        mapper = self._mapper
+        if mapper is None or len(self.frames) < 2:
+            raise ReconstructionError(f"{len(self.frames)} frames, at least 2 needed")
+        with self._timed("mapping"):
+            mapper.finish()
+        registered = sum(image.registered for image in mapper.images)
+        if registered < 2:
+            worst = next((i for i in mapper.images if not i.registered), mapper.images[0])
+            raise ReconstructionError(
+                f"{registered} of {len(mapper.images)} frames registered, at least 2 needed; "
+                f"frame {self.frames[worst.tracks.position].index}: {worst.message}"
+            )
+        with self._timed("polish"):
+            result = polish(
+                mapper.images,
+                mapper.map_points(),
+                mapper.focal,
+                self.options,
+                lambda stage: progress(stage, 0, None) if progress else None,
+            )
+        return assemble(
+            result,
+            mapper.images,
+            self.frames,
+            self._pixels,
+            self._colors,
+            self.camera,
+            metric=self._depth is not None and self._depth.kind is DepthKind.METRIC,
+            focal_guessed=self._focal_guessed,
+            seconds=dict(self.seconds),
+            options=self.options.to_dict(),
+        )
+
+    def _open(self, frame: Frame) -> Mapper:
+        """Everything that waits for the size of the first frame."""
+        height, width = frame.image.shape[:2]
+        if self.camera is None:
+            self.camera = guess_camera(width, height)
+        self._focal_guessed = self.options.refine_focal_length
+        check_camera(self.camera, width, height)
+        self._size = (width, height)
+        focal = 0.5 * (self.camera.focal_length_x + self.camera.focal_length_y)
+        self._mapper = Mapper(focal, width, self.options, has_prior=self._depth is not None)
+        return self._mapper
+
+    def _read_depth(self, frame: Frame, xy: NDArray[np.float64]) -> ImageDepth | None:
+        assert self._depth is not None
+        with self._timed("depth"):
+            depth_map = self._depth(frame)
+            if depth_map is None:
+                return None
+            inverse, reliability = depth_map.inverse_depth(xy, self._size)
+        valid = np.isfinite(inverse) & (inverse > 0.0)
+        if valid.sum() < 10:
+            return None
+        unit = float(np.median(inverse[valid]))
+        free_shift = self._depth.kind is DepthKind.INVERSE
+        return ImageDepth(inverse / unit, reliability, unit, free_shift)
+
+    def _remember_colors(self, image: NDArray[np.uint8], ids: NDArray[np.int64], xy: NDArray[np.float64]) -> None:
+        """Colour of each track at its first appearance, RGB."""
+        fresh = ids >= len(self._colors)
+        if not fresh.any():
+            return
+        x, y = np.rint(xy[fresh]).astype(int).T
+        pixels = image[y, x].reshape(int(fresh.sum()), -1)
+        added = np.zeros((int(ids.max()) + 1 - len(self._colors), 3), np.uint8)
+        added[ids[fresh] - len(self._colors)] = pixels[:, ::-1]
+        self._colors = np.concatenate([self._colors, added])
+
+    @contextmanager
+    def _timed(self, stage: str) -> Iterator[None]:
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[stage] += time.perf_counter() - start
+
+
+def _update(index: int, image: MappedImage) -> FrameUpdate:
+    pose = None
+    if image.rotation is not None:
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(image.rotation), image.translation)
+    return FrameUpdate(
+        index, image.status, image.message, pose, image.keyframe, len(image.tracks.ids), image.inliers
+    )
