@@ -33,15 +33,19 @@ def camera_points(rotation: Array, translation: Array, m: Array, w: Array) -> Ar
     return np.einsum("...ij,...j->...i", rotation, m) + w[..., None] * translation
 
 
-def d_camera_points_d_pose(q: Array, w: Array) -> Array:
-    """(n, 3, 6) derivative of `q` by the pose perturbation (omega, v)."""
-    jacobian = np.zeros((len(q), 3, 6))
+def by_pose(by_q: Array, q: Array, w: Array) -> Array:
+    """Chain a derivative by `q` to the pose perturbation (omega, v).
+
+    Args:
+        by_q: (..., n, 3), last axis the components of `q`; q: (n, 3); w: (n,).
+
+    Returns:
+        (..., n, 6).
+    """
+    gx, gy, gz = np.moveaxis(by_q, -1, 0)
     x, y, z = q.T
-    jacobian[:, 0, 1], jacobian[:, 0, 2] = -z, y
-    jacobian[:, 1, 0], jacobian[:, 1, 2] = z, -x
-    jacobian[:, 2, 0], jacobian[:, 2, 1] = -y, x
-    jacobian[:, [0, 1, 2], [3, 4, 5]] = -w[:, None]
-    return jacobian
+    turn = [gy * z - gz * y, gz * x - gx * z, gx * y - gy * x]
+    return np.stack([*turn, -w * gx, -w * gy, -w * gz], -1)
 
 
 def reprojection(q: Array, observed: Array, focal: float) -> tuple[Array, Array]:
@@ -85,6 +89,11 @@ def affine_depth(q: Array, gamma: float, beta: float, depth: Array) -> tuple[Arr
         Residual (n,) and its derivative by `q_z` (n,); those by gamma and beta are ``-D`` and -1.
     """
     return q[:, 2] - gamma * depth - beta, np.ones(len(q))
+
+
+def _along_z(by_z: Array) -> Array:
+    """A derivative by `q_z` as one by `q`."""
+    return np.stack([np.zeros_like(by_z), np.zeros_like(by_z), by_z], -1)
 
 
 def cauchy(residual: Array, scale: float) -> tuple[Array, Array]:
@@ -155,8 +164,8 @@ def image_reprojection_factor(
         q = camera_points(*camera_from_pose(values.atPose3(pose_key)), points, w)
         q[:, 2] = np.maximum(q[:, 2], 1e-6)
         residual, by_q = reprojection(q, pixels, focal)
-        by_pose = by_q @ d_camera_points_d_pose(q, w) / sigma
-        return _robust_rows(residual / sigma, [by_pose], kernel)
+        block = by_pose(by_q.transpose(1, 0, 2), q, w).transpose(1, 0, 2)
+        return _robust_rows(residual / sigma, [block / sigma], kernel)
 
     return _whole_image_factor([pose_key], 2 * len(points), function)
 
@@ -183,8 +192,7 @@ def image_depth_factor(
         else:
             residual, by_z = affine_depth(q, scale, shift, measured)
             by_affine = np.stack([-measured, -w], -1)
-        by_pose = by_z[:, None] * d_camera_points_d_pose(q, w)[:, 2]
-        blocks = [(by_pose / sigma[:, None])[:, None], (by_affine / sigma[:, None])[:, None]]
+        blocks = [(b / sigma[:, None])[:, None] for b in (by_pose(_along_z(by_z), q, w), by_affine)]
         return _robust_rows((residual / sigma)[:, None], blocks, kernel)
 
     return _whole_image_factor([pose_key, affine_key], len(points), function)
@@ -205,7 +213,7 @@ def depth_consistency_factor(
         scale, shift = values.atVector(affine_key)
         residual, by_z, _ = affine_inverse_depth(q, one, scale, shift, np.array([measured]))
         if jacobians is not None:
-            jacobians[0] = np.asfortranarray(by_z[:, None] * d_camera_points_d_pose(q, one)[:, 2])
+            jacobians[0] = np.asfortranarray(by_pose(_along_z(by_z), q, one))
             jacobians[1] = np.asfortranarray(by_z[:, None] * rotation[2:3])
             jacobians[2] = np.asfortranarray([[1.0 / q[0, 2], 1.0]])
         return residual

@@ -79,7 +79,8 @@ class PolishOptions:
 
     Attributes:
         depth: whether the prior takes part, with the weight that its own residuals justify.
-        iterations: at most, in each stage.
+        iterations: at most, until the cameras have converged on the core tracks.
+        final_iterations: at most, over all tracks and the prior from there.
         tolerance: relative decrease of the cost at which a stage ends.
         kernel: scale of the Cauchy kernel in standard deviations.
         min_track_length: frames in which a track must be seen.
@@ -89,7 +90,8 @@ class PolishOptions:
 
     depth: bool = True
     iterations: int = 60
-    tolerance: float = 1e-6
+    final_iterations: int = 6
+    tolerance: float = 3e-5
     kernel: float = 2.0
     min_track_length: int = 5
     point_sigma: float = 1.0

@@ -29,6 +29,7 @@ _RAYLEIGH_MEDIAN = 1.1774  # median of the norm of a 2-D error, in standard devi
 _CORE_TRACKS = 400  # tracks with which the cameras converge first
 _TRIANGULATION_VIEWS = 10
 _FOCAL_STD = 0.05  # relative standard deviation up to which a focal length counts as determined
+_LEAST_CORRELATION = 0.1  # with the reconstructed inverse depth; below this, or mirrored, a prior is none
 _SCALE_SIGMA, _SHIFT_SIGMA, _NO_SHIFT_SIGMA = 0.5, 0.3, 0.02
 
 
@@ -95,32 +96,36 @@ def polish(
     state = _first_guess(used, observations, tracks, map_points, focal)
 
     progress("polish: cameras")
-    state, sigma = _converge_cameras(state, observations, o)
-    progress("polish: points")
-    state = BundleAdjustment(
-        state, observations, replace(o, iterations=5), sigma=sigma, points_only=True
-    ).solve()
-    adjustment = BundleAdjustment(state, observations, replace(o, iterations=5), sigma=sigma)
-    adjustment.solve()
-    observations, tracks, state = _without_outliers(adjustment, observations, tracks, o.outlier_sigmas)
-    sigma = _noise(adjustment.reprojection_errors())
-    progress("polish: all")
-    adjustment = BundleAdjustment(state, observations, o, sigma=sigma, free_focal=options.refine_focal_length)
-    adjustment.solve()
+    core, few, adjustment = _converge_cameras(state, observations, options)
     focal_std = None
     if options.refine_focal_length:
-        adjustment, focal_std = _checked_focal(adjustment, observations, o, focal)
-
-    motion = _classify(adjustment, observations, o)
-    prior = None
+        adjustment, focal_std = _checked_focal(adjustment, few, o, focal)
+    motion = classify_motion(adjustment, few, o)
+    weighed = None
     if motion.kind is ShotKind.GENERAL:
         if o.depth:
-            progress("polish: prior")
-            adjustment, prior = _with_prior(adjustment, observations, tracks, used, o)
+            weighed = _weigh_prior(adjustment, few, tracks[core], used)
+        part = adjustment.state
     else:
-        still = motion.rotation_only
-        adjustment = BundleAdjustment(still, observations, o, sigma=adjustment.sigma, free_translation=False)
-        adjustment.solve()
+        part = motion.rotation_only
+    free = motion.kind is ShotKind.GENERAL
+
+    progress("polish: points")
+    sigma = adjustment.sigma
+    state = _with_part(state, part, core)
+    state = BundleAdjustment(
+        state, observations, replace(o, iterations=4), sigma=sigma, points_only=True
+    ).solve()
+    observations, tracks, state = _without_outliers(state, observations, tracks, sigma, o)
+    progress("polish: all tracks")
+    prior = None
+    if weighed is not None:
+        adjustment, prior = _joint(state, observations, tracks, used, weighed, sigma, o)
+    else:
+        adjustment = BundleAdjustment(state, observations, o, sigma=sigma, free_translation=free)
+    adjustment.solve(o.final_iterations)
+    if prior is not None:
+        prior.residual = adjustment.prior_residuals()
     camera_covariance, _ = adjustment.covariance(np.zeros(0, np.int64))
     k = len(frames)
     poses = np.stack([camera_covariance[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i in range(k)])
@@ -209,42 +214,48 @@ def _noise(errors: Array) -> float:
     return max(float(np.median(errors)) / _RAYLEIGH_MEDIAN, _SMALLEST_SIGMA_PX)
 
 
-def _converge_cameras(state: State, observations: Observations, options: PolishOptions) -> tuple[State, float]:
-    """All cameras on the core tracks, first with a wide kernel."""
+def _converge_cameras(
+    state: State, observations: Observations, options: Options
+) -> tuple[Index, Observations, BundleAdjustment]:
+    """All cameras on the core tracks, first with a wide kernel: the points, their observations, the solution."""
+    o = options.polish
     core = _core(observations, len(state.rotation), _CORE_TRACKS)
     few = _subset(observations, core)
     part = replace(state, bearing=state.bearing[core], inverse_distance=state.inverse_distance[core])
-    errors = BundleAdjustment(part, few, options, sigma=1.0).reprojection_errors()
+    errors = BundleAdjustment(part, few, o, sigma=1.0).reprojection_errors()
     sigma = max(_FIRST_SIGMA_PX, _noise(errors))
-    adjustment = BundleAdjustment(part, few, replace(options, iterations=20, tolerance=1e-3), sigma=sigma)
+    adjustment = BundleAdjustment(part, few, replace(o, iterations=20, tolerance=1e-3), sigma=sigma)
     adjustment.solve()
     sigma = min(sigma, _noise(adjustment.reprojection_errors()))
-    adjustment = BundleAdjustment(adjustment.state, few, options, sigma=sigma)
-    part = adjustment.solve()
+    adjustment = BundleAdjustment(
+        adjustment.state, few, o, sigma=sigma, free_focal=options.refine_focal_length
+    )
+    adjustment.solve()
     logger.debug("cameras: %d iterations, %.3f px", adjustment.iterations, sigma)
+    adjustment.sigma = _noise(adjustment.reprojection_errors())
+    return core, few, adjustment
+
+
+def _with_part(state: State, part: State, core: Index) -> State:
+    """The cameras and core points of `part`, the other points of `state`."""
     bearing, inverse = state.bearing.copy(), state.inverse_distance.copy()
     bearing[core], inverse[core] = part.bearing, part.inverse_distance
-    state = replace(part, bearing=bearing, inverse_distance=inverse)
-    return state, _noise(adjustment.reprojection_errors())
+    return replace(part, bearing=bearing, inverse_distance=inverse)
 
 
 def _without_outliers(
-    adjustment: BundleAdjustment, observations: Observations, tracks: Index, sigmas: float
+    state: State, observations: Observations, tracks: Index, sigma: float, options: PolishOptions
 ) -> tuple[Observations, Index, State]:
     """Drop tracks whose typical error is far outside that of all tracks (log scale, robust)."""
-    errors = adjustment.reprojection_errors()
+    errors = BundleAdjustment(state, observations, options, sigma=sigma).reprojection_errors()
     start = np.searchsorted(observations.point, np.arange(len(tracks)))
     count = np.diff(np.append(start, len(errors)))
     typical = np.log(np.sqrt(np.add.reduceat(errors**2, start) / count) + 1e-6)
     center = np.median(typical)
     spread = 1.4826 * np.median(np.abs(typical - center))
-    keep = np.nonzero(typical < center + sigmas * max(spread, 0.1))[0]
-    state = adjustment.state
-    return (
-        _subset(observations, keep),
-        tracks[keep],
-        replace(state, bearing=state.bearing[keep], inverse_distance=state.inverse_distance[keep]),
-    )
+    keep = np.nonzero(typical < center + options.outlier_sigmas * max(spread, 0.1))[0]
+    state = replace(state, bearing=state.bearing[keep], inverse_distance=state.inverse_distance[keep])
+    return _subset(observations, keep), tracks[keep], state
 
 
 def _checked_focal(
@@ -259,21 +270,6 @@ def _checked_focal(
         adjustment = BundleAdjustment(scaled, observations, options, sigma=adjustment.sigma)
         adjustment.solve()
     return adjustment, std
-
-
-def _classify(adjustment: BundleAdjustment, observations: Observations, options: PolishOptions) -> Motion:
-    core = _core(observations, len(adjustment.state.rotation), _CORE_TRACKS)
-    state = adjustment.state
-    part = replace(state, bearing=state.bearing[core], inverse_distance=state.inverse_distance[core])
-    few = _subset(observations, core)
-    motion = classify_motion(
-        BundleAdjustment(part, few, options, sigma=adjustment.sigma), few, options
-    )
-    rotation_only = replace(
-        motion.rotation_only, bearing=state.bearing.copy(), inverse_distance=state.inverse_distance.copy()
-    )
-    rotation_only.bearing[core] = motion.rotation_only.bearing
-    return replace(motion, rotation_only=rotation_only)
 
 
 def _temporal_inflation(adjustment: BundleAdjustment, observations: Observations) -> float:
@@ -291,63 +287,97 @@ def _temporal_inflation(adjustment: BundleAdjustment, observations: Observations
     return (1.0 + correlation) / (1.0 - correlation)
 
 
-def _with_prior(
-    adjustment: BundleAdjustment,
-    observations: Observations,
-    tracks: Index,
-    images: list[MappedImage],
-    options: PolishOptions,
-) -> tuple[BundleAdjustment, PriorPart | None]:
-    """Measure how far the prior can be trusted on this shot, then solve once more with it."""
+@dataclass(frozen=True, slots=True)
+class _Weighed:
+    """The prior's error model, the affines that go with it, and the correlation of the pixel errors in time."""
+
+    weight: PriorWeight
+    rows: Index
+    scale: Array
+    shift: Array
+    inflation: float
+
+
+def _weigh_prior(
+    adjustment: BundleAdjustment, observations: Observations, tracks: Index, images: list[MappedImage]
+) -> _Weighed | None:
+    """Measure how far the prior can be trusted on this shot; None where there is none or it is no prior."""
     values = _prior_values(images, observations, tracks)
     if values is None:
-        return adjustment, None
-    rows, image, at, inverse_depth, free_shift = values
-    frame, point = observations.frame[at], observations.point[at]
+        return None
+    point = observations.point[values.at]
     state = adjustment.state
-    q = state.camera_points(frame, point)
+    q = state.camera_points(observations.frame[values.at], point)
     predicted = state.inverse_distance[point] / np.maximum(q[:, 2], 1e-6)
-    scale, shift = np.ones(len(rows)), np.zeros(len(rows))
-    for i in range(len(rows)):
-        mine = image == i
-        scale[i], shift[i], _ = fit_affine(predicted[mine], inverse_depth[mine], free_shift=free_shift)
+    scale, shift = np.ones(len(values.rows)), np.zeros(len(values.rows))
+    for i in range(len(values.rows)):
+        mine = values.image == i
+        scale[i], shift[i], _ = fit_affine(
+            predicted[mine], values.inverse_depth[mine], free_shift=values.free_shift
+        )
     # One value per point: its images repeat the same error.
     seen, index, count = np.unique(point, return_inverse=True, return_counts=True)
-    said = np.bincount(index, (inverse_depth - shift[image]) / scale[image]) / count
+    said = np.bincount(index, (values.inverse_depth - shift[values.image]) / scale[values.image]) / count
     mean_predicted = np.bincount(index, predicted) / count
     sample = sample_points(len(seen))
     inflation = _temporal_inflation(adjustment, observations)
     _, covariance = adjustment.covariance(seen[sample])
-    angles = direction_angles(state.bearing[seen])
-    weight = measure_weight(angles[sample], mean_predicted[sample], said[sample], covariance * inflation)
+    angles = direction_angles(state.bearing[seen[sample]])
+    weight = measure_weight(angles, mean_predicted[sample], said[sample], covariance * inflation)
     logger.info(
-        "prior: smooth error %.2f, local %.2f of the median inverse depth, correlation %.2f; inflation %.1f",
+        "prior: smooth error %.2f, local %.3f of the median inverse depth, correlation %.2f; inflation %.1f",
         weight.smooth, weight.local, weight.correlation, inflation,
     )  # fmt: skip
-    if weight.correlation < 0.1:
-        return adjustment, None
-    nodes, node_weights, information = field_grid(angles, weight)
+    if weight.correlation < _LEAST_CORRELATION:
+        return None
+    return _Weighed(weight, values.rows, scale, shift, inflation)
+
+
+def _joint(
+    state: State,
+    observations: Observations,
+    tracks: Index,
+    images: list[MappedImage],
+    weighed: _Weighed,
+    sigma: float,
+    options: PolishOptions,
+) -> tuple[BundleAdjustment, PriorPart]:
+    """The final problem: all tracks, and the prior at its weight."""
+    values = _prior_values(images, observations, tracks)
+    assert values is not None
+    point = observations.point[values.at]
+    nodes, node_weights, information, rest = field_grid(direction_angles(state.bearing), weighed.weight)
+    count = np.bincount(point, minlength=len(tracks))[point]
     prior = PriorObservations(
-        image, frame, point, inverse_depth,
-        weight.local * scale[image] * np.sqrt(count[index]),
-        nodes[index], node_weights[index], information, _SCALE_SIGMA,
-        _SHIFT_SIGMA if free_shift else _NO_SHIFT_SIGMA,
+        values.image, observations.frame[values.at], point, values.inverse_depth,
+        rest[point] * weighed.scale[values.image] * np.sqrt(count),
+        nodes[point], node_weights[point], information, _SCALE_SIGMA,
+        _SHIFT_SIGMA if values.free_shift else _NO_SHIFT_SIGMA,
     )  # fmt: skip
-    state = replace(state, scale=scale, shift=shift, field=np.zeros(len(information)))
-    wide = float(np.sqrt(inflation))
-    joint = BundleAdjustment(
-        state, observations, replace(options, kernel=options.kernel / wide, iterations=15),
-        sigma=adjustment.sigma * wide, prior=prior,
-    )  # fmt: skip
-    joint.solve()
-    none = np.zeros(len(rows))
-    return joint, PriorPart(weight, rows, prior, joint.prior_residuals(), none, none)
+    state = replace(state, scale=weighed.scale, shift=weighed.shift, field=np.zeros(len(information)))
+    # Pixel errors that repeat themselves weigh less against the prior; the kernel keeps its width in pixels.
+    wide = float(np.sqrt(weighed.inflation))
+    options = replace(options, kernel=options.kernel / wide)
+    joint = BundleAdjustment(state, observations, options, sigma=sigma * wide, prior=prior)
+    none = np.zeros(0)
+    return joint, PriorPart(weighed.weight, values.rows, prior, none, none, none)
+
+
+@dataclass(frozen=True, slots=True)
+class _PriorValues:
+    """Rows of the frames with a prior; and per value its image, its observation and the inverse depth."""
+
+    rows: Index
+    image: Index
+    at: Index
+    inverse_depth: Array
+    free_shift: bool
 
 
 def _prior_values(
     images: list[MappedImage], observations: Observations, tracks: Index
-) -> tuple[Index, Index, Index, Array, bool] | None:
-    """Rows of the frames with a prior; and per value its image, its observation, and the inverse depth."""
+) -> _PriorValues | None:
+    """Values of the prior at the observations, sorted as these; None where no frame carries any."""
     rows, image, at, value = [], [], [], []
     order = np.lexsort((observations.point, observations.frame))
     start = np.searchsorted(observations.frame[order], np.arange(len(images) + 1))
@@ -358,7 +388,7 @@ def _prior_values(
         here = order[start[row] : start[row + 1]]
         own = np.searchsorted(mapped.tracks.ids, tracks[observations.point[here]])
         good = depth.valid[own]
-        if good.sum() < 20:
+        if depth.valid.sum() < 20 or not good.any():
             continue
         image.append(np.full(int(good.sum()), len(rows)))
         rows.append(row)
@@ -369,6 +399,6 @@ def _prior_values(
     flat = np.concatenate(at)
     by_point = np.argsort(flat, kind="stable")
     free_shift = all(images[r].tracks.depth.free_shift for r in rows)  # type: ignore[union-attr]
-    return (
+    return _PriorValues(
         np.array(rows), np.concatenate(image)[by_point], flat[by_point], np.concatenate(value)[by_point], free_shift
     )  # fmt: skip

@@ -90,11 +90,12 @@ def measure_weight(angles: Array, inverse_depth: Array, prior: Array, covariance
     return PriorWeight(*best, correlation)
 
 
-def field_grid(angles: Array, weight: PriorWeight) -> tuple[Index, Array, Array]:
+def field_grid(angles: Array, weight: PriorWeight) -> tuple[Index, Array, Array, Array]:
     """Nodes of the smooth field under a set of directions.
 
     Returns:
-        Node indices (n, 4), bilinear weights (n, 4), and the information matrix of the nodes.
+        Node indices (n, 4), bilinear weights (n, 4), the information matrix of the nodes, and (n,) the standard
+        deviation of what is left to a point: its local error, and what the field does between its nodes.
     """
     columns, rows = _NODES
     low, high = angles.min(0), angles.max(0)
@@ -108,4 +109,8 @@ def field_grid(angles: Array, weight: PriorWeight) -> tuple[Index, Array, Array]
     grid = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), -1).reshape(-1, 2) * step
     distance = np.linalg.norm(grid[:, None] - grid[None], axis=2)
     covariance = weight.smooth**2 * (np.exp(-distance / weight.length) + 1e-6 * np.eye(len(grid)))
-    return nodes, weights, np.linalg.inv(covariance)
+    to_node = weight.smooth**2 * np.exp(-np.linalg.norm(grid[nodes] + low - angles[:, None], axis=2) / weight.length)
+    among = covariance[nodes[:, :, None], nodes[:, None, :]]
+    between = weight.smooth**2 - 2.0 * (weights * to_node).sum(1) + np.einsum("ni,nij,nj->n", weights, among, weights)
+    rest = np.sqrt(weight.local**2 + np.maximum(between, 0.0))
+    return nodes, weights, np.linalg.inv(covariance), rest

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.factors import affine_inverse_depth, camera_points, cauchy, d_camera_points_d_pose, reprojection
+from factorsfm.factors import affine_inverse_depth, by_pose, camera_points, cauchy, reprojection
 from factorsfm.options import PolishOptions
 
 Array = NDArray[np.float64]
@@ -98,12 +98,18 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class _Term:
-    """Linearised residuals: rows (m, d), Jacobians by camera-side columns (m, d, c) and by points (m, d, 3)."""
+    """Linearised residuals, the observations along the last axis (contiguous, so that numpy runs at full speed).
+
+    Attributes:
+        residual: (d, m); by_camera: (c, d, m); by_point: (3, d, m).
+        columns: (m, c) camera-side variables of `by_camera`; frame, point: (m,).
+    """
 
     residual: Array
     by_camera: Array
     columns: Index
     by_point: Array
+    frame: Index
     point: Index
 
 
@@ -224,40 +230,46 @@ class BundleAdjustment:
         s, o = self.state, self.observations
         tangent = _tangent_basis(s.bearing)
         residual, by_q, q = self._reprojection(s)
-        weight = np.sqrt(cauchy(residual, self.options.kernel)[1])[:, None]
-        by_q *= weight[:, :, None]
-        by_focal = (by_q[:, :, :2] @ q[:, :2, None])[:, :, 0]  # d r / d log f = f q_xy / q_z
-        by_pose = by_q @ d_camera_points_d_pose(q, s.inverse_distance[o.point])
+        weight = np.sqrt(cauchy(residual, self.options.kernel)[1])
+        gain = np.ascontiguousarray((by_q * weight[:, None, None]).transpose(1, 0, 2))
+        by_focal = gain[:, :, 0] * q[:, 0] + gain[:, :, 1] * q[:, 1]  # d r / d log f = f q_xy / q_z
+        by_camera = np.concatenate([by_pose(gain, q, s.inverse_distance[o.point]), by_focal[:, :, None]], 2)
+        by_point = gain.transpose(1, 0, 2) @ self._by_point(tangent, o.frame, o.point)
         columns = np.concatenate([6 * o.frame[:, None] + np.arange(6), np.full((len(q), 1), self._lens)], 1)
         terms = [
             _Term(
-                residual * weight,
-                np.concatenate([by_pose, by_focal[:, :, None]], 2),
+                (residual * weight[:, None]).T,
+                np.ascontiguousarray(by_camera.transpose(2, 0, 1)),
                 columns,
-                by_q @ self._by_point(tangent, o.frame, o.point),
+                np.ascontiguousarray(by_point.transpose(2, 1, 0)),
+                o.frame,
                 o.point,
             )
         ]
         if (p := self.prior) is not None:
             value, by_z, by_w, q, prediction = self._prior(s)
-            weight_1 = np.sqrt(cauchy(value[:, None], self.options.kernel)[1])
-            by_z, by_w, unit = by_z * weight_1, by_w * weight_1, weight_1 / p.sigma
-            by_pose = by_z[:, None] * d_camera_points_d_pose(q, s.inverse_distance[p.point])[:, 2]
+            weight = np.sqrt(cauchy(value[:, None], self.options.kernel)[1])
+            by_z, by_w, unit = by_z * weight, by_w * weight, weight / p.sigma
+            along_z = np.zeros((len(q), 3))
+            along_z[:, 2] = by_z
             by_point = by_z[:, None] * self._by_point(tangent, p.frame, p.point)[:, 2]
             by_point[:, 2] += by_w
             by_affine = np.stack([prediction * unit, unit], -1)
             by_field = (s.scale[p.image] * unit)[:, None] * p.node_weights
-            columns = np.concatenate(
-                [
-                    6 * p.frame[:, None] + np.arange(6),
-                    self._affine + 2 * p.image[:, None] + np.arange(2),
-                    self._field + p.nodes,
-                ],
-                1,
+            by_camera = np.concatenate(
+                [by_pose(along_z, q, s.inverse_distance[p.point]), by_affine, by_field], 1
             )
-            by_camera = np.concatenate([by_pose, by_affine, by_field], 1)
+            affine = self._affine + 2 * p.image[:, None] + np.arange(2)
+            columns = np.concatenate([6 * p.frame[:, None] + np.arange(6), affine, self._field + p.nodes], 1)
             terms.append(
-                _Term((value * weight_1)[:, None], by_camera[:, None], columns, by_point[:, None], p.point)
+                _Term(
+                    (value * weight)[None],
+                    np.ascontiguousarray(by_camera.T)[:, None],
+                    columns,
+                    np.ascontiguousarray(by_point.T)[:, None],
+                    p.frame,
+                    p.point,
+                )
             )
         return terms
 
@@ -273,14 +285,23 @@ class BundleAdjustment:
         point, point_gradient = np.zeros((n, 3, 3)), np.zeros((n, 3))
         for t, groups in zip(terms, self._frame_groups(terms), strict=True):
             for rows, columns, local in groups:
-                dense = np.zeros((len(rows), t.residual.shape[1], len(columns)))
-                np.put_along_axis(dense, local, t.by_camera[rows], 2)
-                dense = dense.reshape(-1, len(columns))
-                camera[np.ix_(columns, columns)] += dense.T @ dense
-                gradient[columns] += t.residual[rows].ravel() @ dense
+                entries = t.by_camera[:, :, rows]
+                dense = np.zeros((len(columns), *entries.shape[1:]))
+                if local.shape[0] == 1:
+                    dense[local[0]] = entries
+                else:
+                    np.put_along_axis(dense, np.broadcast_to(local.T[:, None], entries.shape), entries, 0)
+                dense = dense.reshape(len(columns), -1)
+                camera[np.ix_(columns, columns)] += dense @ dense.T
+                gradient[columns] += dense @ t.residual[:, rows].ravel()
             seen, first = np.unique(t.point, return_index=True)
-            point[seen] += np.add.reduceat(np.einsum("mdi,mdj->mij", t.by_point, t.by_point), first)
-            point_gradient[seen] += np.add.reduceat(np.einsum("mdi,md->mi", t.by_point, t.residual), first)
+            for i in range(3):
+                point_gradient[seen, i] += np.add.reduceat((t.by_point[i] * t.residual).sum(0), first)
+                for j in range(i, 3):
+                    sums = np.add.reduceat((t.by_point[i] * t.by_point[j]).sum(0), first)
+                    point[seen, i, j] += sums
+                    if j > i:
+                        point[seen, j, i] += sums
         point[:, 2, 2] += 1.0 / self._point_sigma**2
         point_gradient[:, 2] += (s.inverse_distance - self._anchor) / self._point_sigma**2
         if (p := self.prior) is not None:
@@ -293,21 +314,21 @@ class BundleAdjustment:
         return _Normal(camera, gradient, point, point_gradient, terms)
 
     def _frame_groups(self, terms: list[_Term]) -> list[list[tuple[Index, Index, Index]]]:
-        """For every term and frame: its rows, their columns, and the position of each Jacobian entry among them."""
+        """For every term and frame: its rows, their columns, and the position of each entry among the columns.
+
+        The positions have a single row where they are the same for all rows of the frame.
+        """
         if self._groups is None:
             self._groups = []
-            for t, frame in zip(terms, self._frames_of_terms(), strict=True):
-                order = np.argsort(frame, kind="stable")
+            for t in terms:
+                order = np.argsort(t.frame, kind="stable")
                 groups = []
-                for rows in np.split(order, np.nonzero(np.diff(frame[order]))[0] + 1):
+                for rows in np.split(order, np.nonzero(np.diff(t.frame[order]))[0] + 1):
                     columns, local = np.unique(t.columns[rows], return_inverse=True)
-                    shape = (len(rows), t.residual.shape[1], t.columns.shape[1])
-                    groups.append((rows, columns, np.broadcast_to(local.reshape(len(rows), 1, -1), shape)))
+                    local = local.reshape(len(rows), -1)
+                    groups.append((rows, columns, local[:1] if (local == local[:1]).all() else local))
                 self._groups.append(groups)
         return self._groups
-
-    def _frames_of_terms(self) -> list[Index]:
-        return [self.observations.frame] + ([] if self.prior is None else [self.prior.frame])
 
     def _chunk_indices(self, terms: list[_Term]) -> list[tuple[list[NDArray[np.intp]], Index, slice]]:
         """For every chunk of points: flat positions of the cross blocks of each term, the columns, the points."""
@@ -321,8 +342,8 @@ class BundleAdjustment:
                 flat = []
                 for t, r in zip(terms, rows, strict=True):
                     local = np.searchsorted(columns, t.columns[r])
-                    position = local[:, :, None] * 3 * (end - begin) + 3 * (t.point[r] - begin)[:, None, None]
-                    flat.append((position + np.arange(3)).ravel())
+                    position = local.T[:, None] * 3 * (end - begin) + 3 * (t.point[r] - begin)
+                    flat.append((position + np.arange(3)[:, None]).ravel())
                 self._chunks.append((flat, columns, slice(begin, end)))
         return self._chunks
 
@@ -334,8 +355,9 @@ class BundleAdjustment:
             cross = np.zeros(len(columns) * 3 * n)
             for t, position in zip(normal.terms, flat, strict=True):
                 rows = slice(*np.searchsorted(t.point, [span.start, span.stop]))
-                values = t.by_camera[rows].transpose(0, 2, 1) @ t.by_point[rows]
-                cross += np.bincount(position, values.ravel(), len(cross))
+                a, b = t.by_camera[:, :, rows], t.by_point[:, :, rows]
+                values = sum(a[:, None, d] * b[None, :, d] for d in range(a.shape[1]))
+                cross += np.bincount(position, np.ravel(values), len(cross))
             blocks.append((cross.reshape(len(columns), 3 * n), columns, span))
         return blocks
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from factorsfm.options import TrackerOptions
 
 Array = NDArray[np.float32]
+Image = NDArray[np.uint8]
 
 _PATCH_SUPPORT = 22  # half side of a stored birth patch: the window at half the birth's scale, with its margin
 _GRID = 24  # cells along the longer image side in which the local motion is estimated
@@ -48,7 +49,7 @@ class FlowTracker:
 
     def __init__(self, options: TrackerOptions) -> None:
         self.options = options
-        self._previous: NDArray[np.uint8] | None = None
+        self._previous: Image | None = None
         self._frame = 0
         self._next_id = 0
         self._ids = np.zeros(0, np.int64)
@@ -65,17 +66,17 @@ class FlowTracker:
             image: (h, w, 3) BGR or (h, w) grey.
             mask: (h, w), True where nothing may be tracked.
         """
-        grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        grey = np.ascontiguousarray(image) if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         before = len(self._ids)
         flow = float("nan")
         if self._previous is not None and before:
             start = self._xy
-            kept = self._step(self._previous, np.ascontiguousarray(grey), mask)
+            kept = self._step(self._previous, grey, mask)
             if len(self._ids):
                 flow = float(np.median(np.linalg.norm(self._xy - start[kept], axis=1)))
         lost = before - len(self._ids)
         born = self._replenish(grey, mask)
-        self._previous = np.ascontiguousarray(grey)
+        self._previous = grey
         self._frame += 1
         texture = float(cv2.Laplacian(cv2.GaussianBlur(grey, (0, 0), 1.5), cv2.CV_32F).std())
         return TrackedFrame(self._ids.copy(), self._xy.astype(np.float64), lost, born, flow, texture)
@@ -92,7 +93,7 @@ class FlowTracker:
         self._affine = self._affine[index]
 
     def _step(
-        self, previous: NDArray[np.uint8], grey: NDArray[np.uint8], mask: NDArray[np.bool_] | None
+        self, previous: Image, grey: Image, mask: NDArray[np.bool_] | None
     ) -> NDArray[np.intp]:
         """Flow from the frame before, then re-alignment with the birth patches; returns the kept rows."""
         o = self.options
@@ -173,11 +174,15 @@ _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.003)
 
 
 def _flow_checked(
-    a: NDArray[np.uint8], b: NDArray[np.uint8], xy: Array, window: int, levels: int, limit: float
+    a: Image, b: Image, xy: Array, window: int, levels: int, limit: float
 ) -> tuple[Array, NDArray[np.bool_]]:
-    lk = {"winSize": (window, window), "maxLevel": levels, "criteria": _CRITERIA}
-    forward, status, _ = cv2.calcOpticalFlowPyrLK(a, b, xy, None, **lk)
-    back, status_back, _ = cv2.calcOpticalFlowPyrLK(b, a, forward, None, **lk)
+    """Flow a -> b of points, and whether the way back, tried from where it should end, stays there."""
+    side = (window, window)
+    forward, status, _ = cv2.calcOpticalFlowPyrLK(a, b, xy, None, winSize=side, maxLevel=levels, criteria=_CRITERIA)
+    back, status_back, _ = cv2.calcOpticalFlowPyrLK(
+        b, a, forward, xy.copy(), winSize=side, maxLevel=1, criteria=_CRITERIA,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+    )  # fmt: skip
     ok = (status[:, 0] == 1) & (status_back[:, 0] == 1)
     ok &= np.linalg.norm(back - xy, axis=1) < limit
     return forward, ok
