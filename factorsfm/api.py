@@ -83,5 +83,3 @@ def _guessed_camera(source: object, frame: Frame) -> pycolmap.Camera:
     height, width = frame.image.shape[:2]
     image = Path(source) / frame.name if isinstance(source, str | Path) and Path(source).is_dir() else None
     return guess_camera(width, height, image)
-
-

@@ -74,8 +74,7 @@ def check_camera(camera: pycolmap.Camera, width: int, height: int) -> None:
     """
     if (camera.width, camera.height) != (width, height):
         raise InputError(
-            f"the camera is made for {camera.width}x{camera.height} pixels, "
-            f"but the images have {width}x{height}"
+            f"the camera is made for {camera.width}x{camera.height} pixels, but the images have {width}x{height}"
         )
 
 

@@ -148,9 +148,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"factorsfm {program_version()}")
     common = _Parser(add_help=False)
-    common.add_argument(
-        "-v", "--verbose", action="count", default=0, help="log what happens; twice: in every detail"
-    )
+    common.add_argument("-v", "--verbose", action="count", default=0, help="log what happens; twice: in every detail")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     reconstruct = commands.add_parser(
@@ -187,9 +185,7 @@ def _parser() -> argparse.ArgumentParser:
         help="what moves and is to be ignored: non-zero in the masks (default: none)",
     )
     reconstruct.add_argument("--frames", metavar="START:STOP[:STEP]", help="counted from 0, without STOP")
-    reconstruct.add_argument(
-        "--preset", choices=list(PRESETS), default="default", help="default: %(default)s"
-    )
+    reconstruct.add_argument("--preset", choices=list(PRESETS), default="default", help="default: %(default)s")
 
     demo_command = commands.add_parser(
         "demo",

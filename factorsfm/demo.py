@@ -37,9 +37,7 @@ class DemoResult:
 
     def comparison(self) -> str:
         """The errors in words."""
-        position, step = (
-            100 * float(np.median(e)) / self.path_length for e in (self.errors.ate, self.errors.t_rpe)
-        )
+        position, step = (100 * float(np.median(e)) / self.path_length for e in (self.errors.ate, self.errors.t_rpe))
         return (
             "Against the truth, after similarity alignment (medians): "
             f"camera position {position:.2f} % of the path's length; "
@@ -47,9 +45,7 @@ class DemoResult:
         )
 
 
-def run_demo(
-    directory: str | Path, progress: Callable[[str, int, int | None], None] | None = None
-) -> DemoResult:
+def run_demo(directory: str | Path, progress: Callable[[str, int, int | None], None] | None = None) -> DemoResult:
     """Render, reconstruct and compare; writes the result folder and picture.png into it.
 
     Args:

@@ -171,7 +171,14 @@ def image_reprojection_factor(
 
 
 def image_depth_factor(
-    pose_key: int, affine_key: int, points: Array, measured: Array, sigma: Array, kernel: float, *, domain: str
+    pose_key: int,
+    affine_key: int,
+    points: Array,
+    measured: Array,
+    sigma: Array,
+    kernel: float,
+    *,
+    domain: str,
 ) -> gtsam.CustomFactor:
     """All depth-consistency residuals of one image on its pose and affine, the points held fixed.
 
@@ -222,7 +229,12 @@ def depth_consistency_factor(
 
 
 def native_depth_factor(
-    pose_key: int, offset_key: int, point_key: int, affine_key: int, measured: float, noise: gtsam.noiseModel.Base
+    pose_key: int,
+    offset_key: int,
+    point_key: int,
+    affine_key: int,
+    measured: float,
+    noise: gtsam.noiseModel.Base,
 ) -> gtsam_unstable.ProjectionFactorPPPCCal3_S2:
     """The same residual in C++: the u-coordinate in a virtual camera displaced sideways by `VIRTUAL_BASELINE`.
 
@@ -251,6 +263,4 @@ def affine_of_native(affine: gtsam.Cal3_S2) -> tuple[float, float]:
 
 def native_affine_noise(scale_sigma: float, shift_sigma: float) -> gtsam.noiseModel.Base:
     """Noise of a prior on a native affine; what has no meaning is pinned."""
-    return gtsam.noiseModel.Diagonal.Sigmas(
-        np.array([scale_sigma / VIRTUAL_BASELINE, 1e-6, 1e-6, shift_sigma, 1e-6])
-    )
+    return gtsam.noiseModel.Diagonal.Sigmas(np.array([scale_sigma / VIRTUAL_BASELINE, 1e-6, 1e-6, shift_sigma, 1e-6]))

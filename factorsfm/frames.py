@@ -83,12 +83,8 @@ def read_frames(
         else:
             raise InputError(f"{path} does not exist; a video file or a folder of images is expected")
         return _uniform(found, str(path), selection.start)
-    if isinstance(source, np.ndarray) and (
-        source.ndim == 2 or (source.ndim == 3 and source.shape[-1] in (3, 4))
-    ):
-        raise InputError(
-            f"an array of shape {source.shape} is a single image; a sequence of images is expected"
-        )
+    if isinstance(source, np.ndarray) and (source.ndim == 2 or (source.ndim == 3 and source.shape[-1] in (3, 4))):
+        raise InputError(f"an array of shape {source.shape} is a single image; a sequence of images is expected")
     if not isinstance(source, Iterable):
         raise InputError(
             f"frames cannot be read from a {type(source).__name__}; "

@@ -81,7 +81,9 @@ def start_lifted(image: ImageTracks, min_tracks: int) -> Start | NoStart:
     return Start([image.position], [np.eye(3)], [np.zeros(3)], image.ids[valid], points[valid])
 
 
-def start_pair(images: list[ImageTracks], min_tracks: int, *, focal: float, sigma: float, inlier_px: float) -> Start | NoStart:
+def start_pair(
+    images: list[ImageTracks], min_tracks: int, *, focal: float, sigma: float, inlier_px: float
+) -> Start | NoStart:
     """The paper's start: the pair with most matches of valid depth, lift the first image, PnP the second."""
     best, best_count = None, 0
     for i, a in enumerate(images):
@@ -100,7 +102,13 @@ def start_pair(images: list[ImageTracks], min_tracks: int, *, focal: float, sigm
     shared, in_a, in_b = np.intersect1d(a.ids, b.ids, assume_unique=True, return_indices=True)
     use = valid[in_a]
     result = register_image(
-        points[in_a[use]], b.xy[in_b[use]], np.eye(3), np.zeros(3), focal=focal, sigma=sigma, inlier_px=inlier_px
+        points[in_a[use]],
+        b.xy[in_b[use]],
+        np.eye(3),
+        np.zeros(3),
+        focal=focal,
+        sigma=sigma,
+        inlier_px=inlier_px,
     )
     if result.inliers.sum() < min_tracks // 2:
         return NoStart(f"PnP of the best pair has {result.inliers.sum()} of {min_tracks // 2} needed inliers")
@@ -129,7 +137,9 @@ def start_essential(
     _, rotation, translation, _ = cv2.recoverPose(essential, a, b, np.eye(3), mask=mask.copy())
     keep = mask.ravel() > 0
     n = int(keep.sum())
-    observations = Observations(np.tile([0, 1], n), np.repeat(np.arange(n), 2), np.stack([a[keep], b[keep]], 1).reshape(-1, 2))
+    observations = Observations(
+        np.tile([0, 1], n), np.repeat(np.arange(n), 2), np.stack([a[keep], b[keep]], 1).reshape(-1, 2)
+    )
     points = triangulate(
         np.stack([np.eye(3), rotation]), np.stack([np.zeros(3), translation.ravel()]), observations,
         focal=focal, inlier_px=4.0 * sigma, sigma=sigma, fallback=np.full(n, 1e-6),

@@ -192,9 +192,7 @@ class Mapper:
             image.status = FrameStatus.TOO_FEW_TRACKS
             image.message = f"{mapped.sum()} of {o.min_inliers} needed tracks have a point in the map"
             return
-        near = min(
-            (i for i in self.images if i.registered), key=lambda i: abs(i.tracks.position - tracks.position)
-        )
+        near = min((i for i in self.images if i.registered), key=lambda i: abs(i.tracks.position - tracks.position))
         assert near.rotation is not None
         assert near.translation is not None
         depth = None

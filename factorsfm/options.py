@@ -142,9 +142,7 @@ class Options:
 
 
 def _variant(name: str, mapper: MapperOptions, *, polish_depth: bool = False) -> Options:
-    return replace(
-        Options(), preset=name, mapper=mapper, polish=replace(PolishOptions(), depth=polish_depth)
-    )
+    return replace(Options(), preset=name, mapper=mapper, polish=replace(PolishOptions(), depth=polish_depth))
 
 
 _PAPER = MapperOptions(
@@ -161,7 +159,10 @@ PRESETS: dict[str, Options] = {
     "geometry": _variant(
         "geometry",
         MapperOptions(
-            initialization="essential", registration_depth="none", triangulation_depth="none", graph_depth=False
+            initialization="essential",
+            registration_depth="none",
+            triangulation_depth="none",
+            graph_depth=False,
         ),
     ),
 }

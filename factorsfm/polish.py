@@ -113,9 +113,7 @@ def polish(
     progress("polish: points")
     sigma = adjustment.sigma
     state = _with_part(state, part, core)
-    state = BundleAdjustment(
-        state, observations, replace(o, iterations=4), sigma=sigma, points_only=True
-    ).solve()
+    state = BundleAdjustment(state, observations, replace(o, iterations=4), sigma=sigma, points_only=True).solve()
     observations, tracks, state = _without_outliers(state, observations, tracks, sigma, o)
     progress("polish: all tracks")
     prior = None
@@ -155,7 +153,11 @@ def _gather(images: list[MappedImage], min_length: int) -> tuple[Observations, I
 
 
 def _first_guess(
-    images: list[MappedImage], observations: Observations, tracks: Index, map_points: tuple[Index, Array], focal: float
+    images: list[MappedImage],
+    observations: Observations,
+    tracks: Index,
+    map_points: tuple[Index, Array],
+    focal: float,
 ) -> State:
     """Poses in the first camera's frame, points triangulated from a few views, median inverse distance 1."""
     first = images[0]
@@ -174,7 +176,13 @@ def _first_guess(
     first_of_track[np.searchsorted(observations.point, np.arange(len(tracks)))] = True
     some = Observations(*(a[few | first_of_track] for a in (observations.frame, observations.point, observations.xy)))
     result = triangulate(
-        turn, translation, some, focal=focal, inlier_px=5.0, sigma=_FIRST_SIGMA_PX, fallback=np.ones(len(tracks))
+        turn,
+        translation,
+        some,
+        focal=focal,
+        inlier_px=5.0,
+        sigma=_FIRST_SIGMA_PX,
+        fallback=np.ones(len(tracks)),
     )
     bearing, inverse = result.bearing.copy(), result.inverse_distance.copy()
     mapped = np.isin(tracks, ids)
@@ -227,9 +235,7 @@ def _converge_cameras(
     adjustment = BundleAdjustment(part, few, replace(o, iterations=20, tolerance=1e-3), sigma=sigma)
     adjustment.solve()
     sigma = min(sigma, _noise(adjustment.reprojection_errors()))
-    adjustment = BundleAdjustment(
-        adjustment.state, few, o, sigma=sigma, free_focal=options.refine_focal_length
-    )
+    adjustment = BundleAdjustment(adjustment.state, few, o, sigma=sigma, free_focal=options.refine_focal_length)
     adjustment.solve()
     logger.debug("cameras: %d iterations, %.3f px", adjustment.iterations, sigma)
     adjustment.sigma = _noise(adjustment.reprojection_errors())
@@ -312,9 +318,7 @@ def _weigh_prior(
     scale, shift = np.ones(len(values.rows)), np.zeros(len(values.rows))
     for i in range(len(values.rows)):
         mine = values.image == i
-        scale[i], shift[i], _ = fit_affine(
-            predicted[mine], values.inverse_depth[mine], free_shift=values.free_shift
-        )
+        scale[i], shift[i], _ = fit_affine(predicted[mine], values.inverse_depth[mine], free_shift=values.free_shift)
     # One value per point: its images repeat the same error.
     seen, index, count = np.unique(point, return_inverse=True, return_counts=True)
     said = np.bincount(index, (values.inverse_depth - shift[values.image]) / scale[values.image]) / count
@@ -374,9 +378,7 @@ class _PriorValues:
     free_shift: bool
 
 
-def _prior_values(
-    images: list[MappedImage], observations: Observations, tracks: Index
-) -> _PriorValues | None:
+def _prior_values(images: list[MappedImage], observations: Observations, tracks: Index) -> _PriorValues | None:
     """Values of the prior at the observations, sorted as these; None where no frame carries any."""
     rows, image, at, value = [], [], [], []
     order = np.lexsort((observations.point, observations.frame))

@@ -8,7 +8,7 @@ distance, in which small motion is almost linear.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -256,9 +256,7 @@ class BundleAdjustment:
             by_point[:, 2] += by_w
             by_affine = np.stack([prediction * unit, unit], -1)
             by_field = (s.scale[p.image] * unit)[:, None] * p.node_weights
-            by_camera = np.concatenate(
-                [by_pose(along_z, q, s.inverse_distance[p.point]), by_affine, by_field], 1
-            )
+            by_camera = np.concatenate([by_pose(along_z, q, s.inverse_distance[p.point]), by_affine, by_field], 1)
             affine = self._affine + 2 * p.image[:, None] + np.arange(2)
             columns = np.concatenate([6 * p.frame[:, None] + np.arange(6), affine, self._field + p.nodes], 1)
             terms.append(
@@ -383,9 +381,7 @@ class BundleAdjustment:
             gradient[columns] -= cross @ step.ravel()
         return information, gradient, point_covariance
 
-    def _step(
-        self, normal: _Normal, blocks: list[tuple[Array, Index, slice]], damping: float
-    ) -> tuple[Array, Array]:
+    def _step(self, normal: _Normal, blocks: list[tuple[Array, Index, slice]], damping: float) -> tuple[Array, Array]:
         information, gradient, point_covariance = self._reduced(normal, blocks, damping)
         free = self._free
         camera = np.zeros(self._columns)

@@ -143,7 +143,13 @@ def _optimize(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.
 
 
 def _refine(
-    points: Array, observed: Array, rotation: Array, translation: Array, focal: float, sigma: float, inlier_px: float
+    points: Array,
+    observed: Array,
+    rotation: Array,
+    translation: Array,
+    focal: float,
+    sigma: float,
+    inlier_px: float,
 ) -> Registration:
     """Robust pose; the kernel follows the spread of the residuals, since a young map is not yet exact."""
     error = _residuals(points, observed, rotation, translation, focal)
@@ -210,5 +216,10 @@ def _refine_with_depth(
     if inliers.sum() < 0.8 * result.inliers.sum():
         return result
     return Registration(
-        rotation, translation, inliers, float(np.median(error[inliers])), result.threshold, (float(scale), float(shift))
+        rotation,
+        translation,
+        inliers,
+        float(np.median(error[inliers])),
+        result.threshold,
+        (float(scale), float(shift)),
     )

@@ -203,5 +203,3 @@ def _notes(polished: Polished, focal_guessed: bool) -> list[str]:
         else:
             notes.append(f"The focal length is a guess ({focal:.0f} pixels): this shot does not determine it.")
     return notes
-
-

@@ -118,11 +118,13 @@ class Stream:
             tracked = self._tracker.track(frame.image, mask)
         self._remember_colors(frame.image, tracked.ids, tracked.xy)
         xy = normalized_from_pixels(self.camera, tracked.xy)
-        tracks = ImageTracks(len(self.frames), tracked.ids, xy)
+        undistorted = np.isfinite(xy).all(axis=1)  # a distortion model may have no inverse in the corners
+        pixels = tracked.xy[undistorted]
+        tracks = ImageTracks(len(self.frames), tracked.ids[undistorted], xy[undistorted])
         self.frames.append(SeenFrame(frame.index, frame.name, frame.timestamp))
-        self._pixels.append(tracked.xy)
+        self._pixels.append(pixels)
         with self._timed("mapping"):
-            image = mapper.add(tracks, lambda: self._read_depth(frame, tracked.xy))
+            image = mapper.add(tracks, lambda: self._read_depth(frame, pixels))
         if tracked.texture < _BLANK_TEXTURE and not image.registered:
             image.status = FrameStatus.BLANK
             image.message = f"contrast {tracked.texture:.1f} of {_BLANK_TEXTURE:.1f} needed grey levels"
@@ -217,6 +219,4 @@ def _update(index: int, image: MappedImage) -> FrameUpdate:
     pose = None
     if image.rotation is not None:
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(image.rotation), image.translation)
-    return FrameUpdate(
-        index, image.status, image.message, pose, image.keyframe, len(image.tracks.ids), image.inliers
-    )
+    return FrameUpdate(index, image.status, image.message, pose, image.keyframe, len(image.tracks.ids), image.inliers)

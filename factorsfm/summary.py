@@ -97,9 +97,7 @@ def with_total(seconds: Mapping[str, float]) -> dict[str, float]:
 def json_text(value: Any, indent: int | None = 1) -> str:
     """Valid JSON: NaN and infinity become null, numpy values and paths plain ones."""
     separators = (",", ":") if indent is None else None
-    return json.dumps(
-        _plain(value), indent=indent, separators=separators, allow_nan=False, ensure_ascii=False
-    )
+    return json.dumps(_plain(value), indent=indent, separators=separators, allow_nan=False, ensure_ascii=False)
 
 
 def _frame_json(frame: FrameResult) -> dict[str, Any]:

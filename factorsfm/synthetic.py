@@ -127,18 +127,14 @@ def _pinhole(width: int, height: int) -> pycolmap.Camera:
     )
 
 
-def _camera_path(
-    motion: str, frames: int, parallax: float, depth: float, seed: int
-) -> list[pycolmap.Rigid3d]:
+def _camera_path(motion: str, frames: int, parallax: float, depth: float, seed: int) -> list[pycolmap.Rigid3d]:
     """cam_from_world for a path that starts at the identity and strays by parallax * depth at most."""
     if motion not in get_args(Motion):
         raise InputError(f'motion "{motion}" is unknown; one of {", ".join(get_args(Motion))} is expected')
     if frames < 2:
         raise InputError(f"a synthetic shot of {frames} frames was asked for; it needs at least 2")
     if not 0 <= parallax < 1:
-        raise InputError(
-            f"a synthetic shot of parallax {parallax:g} was asked for; it must be at least 0 and below 1"
-        )
+        raise InputError(f"a synthetic shot of parallax {parallax:g} was asked for; it must be at least 0 and below 1")
     time = np.linspace(0, 1, frames)
     centers = np.zeros((frames, 3))
     rotations = np.zeros((frames, 3))  # axis times angle, world from camera
@@ -210,10 +206,7 @@ def render_shot(
     quads = _room(np.random.default_rng(seed))
     depth = float(np.median(1 / _cast(quads, camera, pycolmap.Rigid3d(), 1).inverse_depth))
     path = _camera_path(motion, frames, parallax, depth, seed)
-    textures = [
-        _texture(np.random.default_rng([seed, i]), quad, camera.focal_length_x)
-        for i, quad in enumerate(quads)
-    ]
+    textures = [_texture(np.random.default_rng([seed, i]), quad, camera.focal_length_x) for i, quad in enumerate(quads)]
     return RenderedShot(
         images=[_render(quads, textures, camera, pose) for pose in path],
         depths=[(1 / _cast(quads, camera, pose, 1).inverse_depth).astype(np.float32) for pose in path],
@@ -396,8 +389,7 @@ def _texture(generator: np.random.Generator, quad: _Quad, focal_length: float) -
 
     brick = generator.uniform([0.3, 0.15], [0.6, 0.4])
     u, v = (
-        (np.arange(n) + 0.5) / n * side / pitch
-        for n, side, pitch in zip((width, height), length, brick, strict=True)
+        (np.arange(n) + 0.5) / n * side / pitch for n, side, pitch in zip((width, height), length, brick, strict=True)
     )
     row = np.floor(v).astype(int)[:, None]
     along = u[None, :] + 0.5 * (row % 2)

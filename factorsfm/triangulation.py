@@ -79,15 +79,17 @@ def triangulate(
     chosen = stacked[best, np.arange(n)]
     distance = np.linalg.norm(chosen[:, :3], axis=1)
     state = State(
-        rotation, translation, chosen[:, :3] / distance[:, None], chosen[:, 3] / distance, float(np.log(focal))
+        rotation,
+        translation,
+        chosen[:, :3] / distance[:, None],
+        chosen[:, 3] / distance,
+        float(np.log(focal)),
     )
     if affine is not None:
         state = replace(state, scale=affine[:, 0], shift=affine[:, 1], field=np.zeros(1))
     options = replace(PolishOptions(), iterations=8)
     state = BundleAdjustment(state, o, options, sigma=sigma, prior=prior, points_only=True).solve()
-    error = _support(
-        rotation, translation, o, np.c_[state.bearing, state.inverse_distance], focal, inlier_px
-    )
+    error = _support(rotation, translation, o, np.c_[state.bearing, state.inverse_distance], focal, inlier_px)
     inliers = np.add.reduceat((error < inlier_px).astype(np.int64), start)
     return Triangulation(state.bearing, state.inverse_distance, inliers, angle)
 
@@ -111,9 +113,7 @@ def _two_view(
     return np.where(depth[:, None] < 0.0, -point, point)
 
 
-def _support(
-    rotation: Array, translation: Array, o: Observations, points: Array, focal: float, limit: float
-) -> Array:
+def _support(rotation: Array, translation: Array, o: Observations, points: Array, focal: float, limit: float) -> Array:
     """(m,) reprojection errors (pixels) of homogeneous points; beyond infinity or behind the camera counts as miss."""
     q = camera_points(rotation[o.frame], translation[o.frame], points[o.point, :3], points[o.point, 3])
     front = (q[:, 2] > 1e-9) & (points[o.point, 3] > 0.0)

@@ -183,9 +183,7 @@ def test_degrade_blurs(image):
 def test_degrade_compresses(image):
     rng = np.random.default_rng(2)
     busy = rng.integers(0, 255, (64, 64, 3), np.uint8)
-    loss = [
-        np.abs(degrade(busy, rng, 0.0, 0.0, quality).astype(float) - busy).mean() for quality in (10, 40, 95)
-    ]
+    loss = [np.abs(degrade(busy, rng, 0.0, 0.0, quality).astype(float) - busy).mean() for quality in (10, 40, 95)]
     assert loss[0] > loss[1] > loss[2] > 0
 
 
@@ -199,9 +197,7 @@ def test_degraded_frames_are_the_same_in_every_run_and_range(image):
     frames = [Frame(i, image, f"{i:06d}", i / 24) for i in range(3)]
     all_of_them = list(degraded_frames(frames, seed=5))
     alone = next(degraded_frames(frames[2:], seed=5))
-    assert [(f.index, f.name, f.timestamp) for f in all_of_them] == [
-        (f.index, f.name, f.timestamp) for f in frames
-    ]
+    assert [(f.index, f.name, f.timestamp) for f in all_of_them] == [(f.index, f.name, f.timestamp) for f in frames]
     assert_array_equal(all_of_them[2].image, alone.image)
     assert (all_of_them[0].image != all_of_them[1].image).any()
     assert (next(degraded_frames(frames, seed=6)).image != all_of_them[0].image).any()

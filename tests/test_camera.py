@@ -71,9 +71,7 @@ def test_pixels_agree_with_opencv_and_return(tmp_path, model):
     }
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
     rays = np.column_stack([uv, np.ones(len(uv))])
-    projected, _ = cv2.projectPoints(
-        rays, np.zeros(3), np.zeros(3), matrix, np.array(distortion[model], float)
-    )
+    projected, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, np.array(distortion[model], float))
     np.testing.assert_allclose(projected[:, 0], xy, rtol=0, atol=1e-6)
 
 

@@ -167,9 +167,7 @@ def test_a_shot_that_cannot_be_reconstructed_leaves_the_reason(
     assert (summary["source"], summary["options"]["preset"]) == ("shot.mp4", "geometry")
 
 
-def test_interrupt(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_interrupt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     fail_with(monkeypatch, KeyboardInterrupt())
     assert main(["reconstruct", "shot.mp4", "--output", str(tmp_path / "out")]) == 130
     assert capsys.readouterr().err == "factorsfm: interrupted\n"

@@ -350,9 +350,7 @@ def test_fastdepth_gives_plausible_metres(shared_data: Path, shared_models: Path
     v, u = np.nonzero(np.isfinite(truth))
     metres, _ = found.depth(np.column_stack([3 * u + 1, 3 * v + 1]), (960, 540))
     assert 1.0 < metres.min() < np.median(metres) < metres.max() < 10.0
-    assert (
-        0.3 < np.median(metres) / np.nanmedian(truth) < 1.5
-    )  # measured 0.52: its scale is that of its rooms
+    assert 0.3 < np.median(metres) / np.nanmedian(truth) < 1.5  # measured 0.52: its scale is that of its rooms
     assert 0.7 < rank_correlation(metres, truth[v, u]) < 0.9  # measured 0.81
 
 
@@ -373,9 +371,7 @@ def test_open_depth(tmp_path: Path) -> None:
 
 
 def test_open_depth_refuses_anything_else(tmp_path: Path) -> None:
-    expected = (
-        "expected an existing folder of depth maps, an .onnx file, a named network .tcmonodepth. or none"
-    )
+    expected = "expected an existing folder of depth maps, an .onnx file, a named network .tcmonodepth. or none"
     for spec in ("nothing", tmp_path / "missing", __file__):
         with pytest.raises(InputError, match=expected):
             open_depth(spec)

@@ -29,9 +29,9 @@ def make_mask(shape: tuple[int, int] = (48, 64), value: int = 255) -> NDArray[np
 
 
 def expected_mask(grown: int = 0) -> NDArray[np.bool_]:
-    return cv2.dilate(
-        make_mask(), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * grown + 1, 2 * grown + 1))
-    ).astype(bool)
+    return cv2.dilate(make_mask(), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * grown + 1, 2 * grown + 1))).astype(
+        bool
+    )
 
 
 @pytest.mark.parametrize("shape", [(48, 64), (24, 32), (96, 128), (12, 16)])

@@ -144,9 +144,7 @@ def test_align_refuses_bad_input(trajectory):
 
 def test_pose_arrays(trajectory):
     rotations, centers = trajectory
-    poses = [
-        pycolmap.Rigid3d(pycolmap.Rotation3d(r), c).inverse() for r, c in zip(rotations, centers, strict=True)
-    ]
+    poses = [pycolmap.Rigid3d(pycolmap.Rotation3d(r), c).inverse() for r, c in zip(rotations, centers, strict=True)]
     found_rotations, found_centers = pose_arrays([poses[0], None, *poses[2:]])
     assert_allclose(np.delete(found_rotations, 1, 0), np.delete(rotations, 1, 0), atol=1e-12)
     assert_allclose(np.delete(found_centers, 1, 0), np.delete(centers, 1, 0), atol=1e-12)

@@ -78,9 +78,7 @@ def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         running.shutdown()
 
 
-def test_models_folder_is_used_first(
-    cache: Path, shared_models: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_models_folder_is_used_first(cache: Path, shared_models: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     cache.mkdir()
     (cache / FILE).write_bytes(b"never looked at")
     monkeypatch.setenv("FACTORSFM_MODELS", str(shared_models))
@@ -136,9 +134,7 @@ def test_named_network_is_fetched_once(cache: Path, server: Path, shared_models:
 
 
 @pytest.mark.parametrize("content", [b"something else", None])
-def test_wrong_or_missing_file_at_the_origin_leaves_no_trace(
-    cache: Path, server: Path, content: bytes | None
-) -> None:
+def test_wrong_or_missing_file_at_the_origin_leaves_no_trace(cache: Path, server: Path, content: bytes | None) -> None:
     if content is not None:
         (server / FILE).write_bytes(content)
     with pytest.raises(ModelError, match="could not be fetched"):
@@ -147,9 +143,7 @@ def test_wrong_or_missing_file_at_the_origin_leaves_no_trace(
 
 
 def test_unknown_file_or_name() -> None:
-    with pytest.raises(
-        ModelError, match="no network moonodepth; expected an ONNX file or one of: tcmonodepth"
-    ):
+    with pytest.raises(ModelError, match="no network moonodepth; expected an ONNX file or one of: tcmonodepth"):
         models.find_model("moonodepth")
 
 
@@ -301,9 +295,7 @@ def test_failure_while_running(tmp_path: Path, capfd: pytest.CaptureFixture[str]
         helper.make_node("Constant", [], ["shape"], value_ints=[7]),
         helper.make_node("Reshape", ["image", "shape"], ["out"]),
     ]
-    network = Network(
-        save_network(tmp_path / "x.onnx", [1, 3, "h", "w"], reshape), NetworkSpec(size=(32, 64))
-    )
+    network = Network(save_network(tmp_path / "x.onnx", [1, 3, "h", "w"], reshape), NetworkSpec(size=(32, 64)))
     with pytest.raises(ModelError, match=r"x\.onnx fails on an input of 64x32"):
         network(np.zeros((8, 8, 3), np.uint8))
     assert capfd.readouterr() == ("", "")

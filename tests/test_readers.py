@@ -30,9 +30,7 @@ CENTER = np.array([1.0, -2.0, 0.5])
 
 
 def camera():
-    return pycolmap.Camera(
-        camera_id=1, model="PINHOLE", width=WIDTH, height=HEIGHT, params=[10.0, 11.0, 6.0, 4.0]
-    )
+    return pycolmap.Camera(camera_id=1, model="PINHOLE", width=WIDTH, height=HEIGHT, params=[10.0, 11.0, 6.0, 4.0])
 
 
 def write_image(path: Path, level: int) -> None:
@@ -365,8 +363,7 @@ def test_read_tum(tmp_path):
     (tmp_path / "rgb.txt").write_text(f"# color images\n{lines}\n")
     (tmp_path / "depth.txt").write_text("100.04 depth/100.04.png\n")
     poses = [
-        " ".join(map(str, [t, *(CENTER + i), *QUATERNION]))
-        for i, t in enumerate((99.99, 100.005, 100.065, 100.4))
+        " ".join(map(str, [t, *(CENTER + i), *QUATERNION])) for i, t in enumerate((99.99, 100.005, 100.065, 100.4))
     ]
     (tmp_path / "groundtruth.txt").write_text("# ground truth\n" + "\n".join(poses) + "\n")
     shot = read_tum(tmp_path, camera())

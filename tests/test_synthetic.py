@@ -68,9 +68,7 @@ def test_points_behind_the_camera_are_not_seen():
 
 def test_observation_noise_has_the_size_asked_for():
     scene = synthetic_scene("dolly", points=800)
-    exact, noisy, again, other = (
-        scene.observe(noise, seed) for noise, seed in ((0, 0), (0.5, 1), (0.5, 1), (0.5, 2))
-    )
+    exact, noisy, again, other = (scene.observe(noise, seed) for noise, seed in ((0, 0), (0.5, 1), (0.5, 1), (0.5, 2)))
     error = np.concatenate([n[1] - e[1] for n, e in zip(noisy, exact, strict=True)])
     assert error.std() == pytest.approx(0.5, rel=0.03)
     assert error.mean() == pytest.approx(0, abs=0.02)

@@ -233,9 +233,7 @@ def global_options() -> pycolmap.GlobalPipelineOptions:
     return options
 
 
-def _incremental(
-    matches: Matches, options: pycolmap.IncrementalPipelineOptions
-) -> pycolmap.Reconstruction | None:
+def _incremental(matches: Matches, options: pycolmap.IncrementalPipelineOptions) -> pycolmap.Reconstruction | None:
     return _largest(
         pycolmap.incremental_mapping(
             matches.folder / "database.db", matches.folder / "images", _new_folder(matches.folder), options
@@ -259,9 +257,7 @@ def _image_name(index: int) -> str:
     return f"{index:06d}.png"
 
 
-def _result(
-    matches: Matches, model: pycolmap.Reconstruction | None, mapping: float, settings: str
-) -> BaselineResult:
+def _result(matches: Matches, model: pycolmap.Reconstruction | None, mapping: float, settings: str) -> BaselineResult:
     posed, points = [], {}
     if model is not None:
         posed = [image for image in model.images.values() if image.has_pose]

@@ -87,9 +87,7 @@ def rotation_angle(a: Array, b: Array) -> Array:
     return np.asarray(np.degrees(2.0 * np.arcsin(np.clip(chord, 0.0, 1.0))))
 
 
-def relative_pose_errors(
-    rotations: Array, centers: Array, true_rotations: Array, true_centers: Array
-) -> Array:
+def relative_pose_errors(rotations: Array, centers: Array, true_rotations: Array, true_centers: Array) -> Array:
     """(n (n - 1) / 2,) the larger of rotation and translation-direction error of every pair, degrees.
 
     Pairs with an unregistered frame have 180. Where the truth does not move between the two frames there is

@@ -282,9 +282,7 @@ def _number(name: str) -> int:
 def _images(folder: Path) -> tuple[Path, ...]:
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder")
-    return tuple(
-        sorted((p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES), key=_natural_key)
-    )
+    return tuple(sorted((p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES), key=_natural_key))
 
 
 def _natural_key(path: Path) -> list[str | int]:
@@ -333,9 +331,7 @@ def _read_table(path: Path, columns: int) -> Array:
 
 def _read_tum_list(folder: Path, name: str) -> tuple[Array, tuple[Path, ...]]:
     rows = [
-        line.split(maxsplit=1)
-        for line in _read_text(folder / name).splitlines()
-        if line.strip() and line[0] != "#"
+        line.split(maxsplit=1) for line in _read_text(folder / name).splitlines() if line.strip() and line[0] != "#"
     ]
     try:
         stamped = sorted((float(time), folder / path.strip()) for time, path in rows)
@@ -356,9 +352,7 @@ def _from_quaternions(rows: Array) -> tuple[Array, Array]:
     """Rotations (n, 3, 3) and centres (n, 3) of rows ``tx ty tz qx qy qz qw``, camera to world."""
     norms = np.linalg.norm(rows[:, 3:], axis=1)
     if not (np.isfinite(rows).all() and (np.abs(norms - 1.0) < 1e-2).all()):
-        raise InputError(
-            "the true trajectory holds values that are not finite or quaternions not of length 1"
-        )
+        raise InputError("the true trajectory holds values that are not finite or quaternions not of length 1")
     rotations = [pycolmap.Rotation3d(q / norm).matrix() for q, norm in zip(rows[:, 3:], norms, strict=True)]
     return np.array(rotations).reshape(-1, 3, 3), rows[:, :3].copy()
 

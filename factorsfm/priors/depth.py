@@ -81,9 +81,7 @@ class DepthMap:
         values, reliability = self._look_up(xy, image_size)
         return (values if self.kind is DepthKind.INVERSE else 1.0 / values), reliability
 
-    def depth(
-        self, xy: ArrayLike, image_size: tuple[int, int]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def depth(self, xy: ArrayLike, image_size: tuple[int, int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Depth at keypoints, and its reliability: as `inverse_depth`, for the domain of depth."""
         values, reliability = self._look_up(xy, image_size)
         return (1.0 / values if self.kind is DepthKind.INVERSE else values), reliability
@@ -112,9 +110,7 @@ class DepthMap:
         reliability = np.clip((edge - (highest - lowest) / spread) / (edge - slope), 0.0, 1.0)
         return np.where(valid, reliability, 0.0).astype(np.float32)
 
-    def _look_up(
-        self, xy: ArrayLike, image_size: tuple[int, int]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _look_up(self, xy: ArrayLike, image_size: tuple[int, int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         points = np.asarray(xy, dtype=np.float64).reshape(-1, 2)
         size = np.array(image_size, dtype=np.float64)
         inside = np.all((points >= -0.5) & (points <= size - 0.5), axis=1)
@@ -225,8 +221,7 @@ class DepthFolder:
         suffix = self._files.suffix
         if suffix == ".exr" and not cv2.haveImageReader(str(self._files.first)):
             raise InputError(
-                f"{self._files.first} cannot be read by this build of OpenCV; convert the maps to .npy or "
-                "16-bit .png"
+                f"{self._files.first} cannot be read by this build of OpenCV; convert the maps to .npy or 16-bit .png"
             )
         if kind is None:
             self.kind = DepthKind.DEPTH if suffix == ".png" else DepthKind.INVERSE
@@ -251,9 +246,7 @@ class DepthFolder:
         return DepthMap(values, self.kind)
 
 
-def open_depth(
-    spec: str | Path | DepthPrior | None, kind: DepthKind | str | None = None
-) -> DepthPrior | None:
+def open_depth(spec: str | Path | DepthPrior | None, kind: DepthKind | str | None = None) -> DepthPrior | None:
     """The depth prior that a user means.
 
     Args:
@@ -332,8 +325,7 @@ def check_aspect(array: NDArray[Any], frame: Frame, path: Path) -> None:
     (height, width), (frame_height, frame_width) = array.shape[:2], frame.image.shape[:2]
     if abs(width * frame_height / (height * frame_width) - 1.0) > _ASPECT_TOLERANCE:
         raise InputError(
-            f"{path} is {width}x{height} and its frame {frame_width}x{frame_height}: "
-            "the aspect ratios must agree"
+            f"{path} is {width}x{height} and its frame {frame_width}x{frame_height}: the aspect ratios must agree"
         )
 
 
@@ -381,9 +373,7 @@ def _default_model_kind(path: Path) -> DepthKind:
     family = network_family(path)
     kind = DepthKind.DEPTH if family == "fastdepth" else DepthKind.INVERSE
     if family is None:
-        logger.warning(
-            "%s is not a known depth network: its output is taken as %s", path.name, _describe(kind)
-        )
+        logger.warning("%s is not a known depth network: its output is taken as %s", path.name, _describe(kind))
     return kind
 
 

@@ -77,9 +77,7 @@ NETWORK_SPECS: dict[str, NetworkSpec] = {
     "tcmonodepth": NetworkSpec(value_max=255.0, size=(192, 320)),
     "depth_anything": replace(IMAGENET, free_height=518, multiple_of=14, interpolation="cubic"),
     "fastdepth": NetworkSpec(layout="NHWC", size=(224, 224)),
-    "deeplab": NetworkSpec(
-        layout="NHWC", value_max=255.0, mean=(128.0,) * 3, std=(128.0,) * 3, size=(513, 513)
-    ),
+    "deeplab": NetworkSpec(layout="NHWC", value_max=255.0, mean=(128.0,) * 3, std=(128.0,) * 3, size=(513, 513)),
     "dpt": NetworkSpec(mean=(0.5,) * 3, std=(0.5,) * 3, interpolation="cubic"),
     "midas": replace(IMAGENET, free_height=256, interpolation="cubic"),
 }
@@ -184,8 +182,7 @@ def _image_input(session: Any, path: Path) -> tuple[Any, list[int | None]]:
         return inputs[0], shape
     found = ", ".join(f"{i.name} {i.type}{i.shape}" for i in inputs) or "none"
     raise ModelError(
-        f"{path.name} is not an image network: expected one 4-D float input with 3 channels and batch 1, "
-        f"found {found}"
+        f"{path.name} is not an image network: expected one 4-D float input with 3 channels and batch 1, found {found}"
     )
 
 
@@ -224,7 +221,6 @@ def _checked_spec(spec: NetworkSpec, path: Path, shape: list[int | None]) -> Net
         return replace(spec, size=(height, width))
     if spec.size is not None and (height or spec.size[0], width or spec.size[1]) != spec.size:
         raise ModelError(
-            f"the spec of {path.name} says height and width {spec.size}, and the network takes "
-            f"{(height, width)}"
+            f"the spec of {path.name} says height and width {spec.size}, and the network takes {(height, width)}"
         )
     return spec

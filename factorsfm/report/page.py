@@ -30,9 +30,7 @@ def report_html(reconstruction: Reconstruction) -> str:
         notes="".join(f"<li>{escape(note)}</li>" for note in reconstruction.notes),
         facts=_facts(reconstruction),
         unregistered=_unregistered(reconstruction),
-        timings=_table(
-            {stage: f"{value:.2f} s" for stage, value in with_total(reconstruction.seconds).items()}
-        ),
+        timings=_table({stage: f"{value:.2f} s" for stage, value in with_total(reconstruction.seconds).items()}),
         options=_table(_flat(reconstruction.options)),
         version=escape(program_version()),
         # "</" would end the script element
@@ -106,8 +104,7 @@ def _words(status: FrameStatus) -> str:
 
 def _table(values: Mapping[str, Any]) -> str:
     rows = "".join(
-        f'<tr><th scope="row">{escape(key)}</th><td>{escape(str(value))}</td></tr>'
-        for key, value in values.items()
+        f'<tr><th scope="row">{escape(key)}</th><td>{escape(str(value))}</td></tr>' for key, value in values.items()
     )
     return f'<div class="scroll"><table><tbody>{rows}</tbody></table></div>' if rows else "<p>None.</p>"
 

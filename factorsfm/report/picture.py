@@ -114,9 +114,7 @@ def _depth_colors(depth: NDArray[np.float64]) -> NDArray[np.int64]:
     return np.round(np.stack(channels, axis=1)).astype(np.int64)
 
 
-def _card(
-    canvas: NDArray[np.uint8], x: int, y: int, width: int, height: int, title: str
-) -> NDArray[np.uint8]:
+def _card(canvas: NDArray[np.uint8], x: int, y: int, width: int, height: int, title: str) -> NDArray[np.uint8]:
     """A framed part of the canvas; drawing into it draws into the canvas."""
     cv2.rectangle(canvas, (x, y), (x + width - 1, y + height - 1), _CARD, -1)
     cv2.rectangle(canvas, (x, y), (x + width - 1, y + height - 1), _LINE, 1)
@@ -128,7 +126,5 @@ def _fixed(u: float, v: float) -> tuple[int, int]:
     return round(u * 2**_SUBPIXEL), round(v * 2**_SUBPIXEL)
 
 
-def _text(
-    image: NDArray[np.uint8], text: str, at: tuple[int, int], size: float, color: tuple[int, int, int]
-) -> None:
+def _text(image: NDArray[np.uint8], text: str, at: tuple[int, int], size: float, color: tuple[int, int, int]) -> None:
     cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, color, 1, cv2.LINE_AA)

@@ -92,9 +92,7 @@ class FlowTracker:
         self._patches = self._patches[index]
         self._affine = self._affine[index]
 
-    def _step(
-        self, previous: Image, grey: Image, mask: NDArray[np.bool_] | None
-    ) -> NDArray[np.intp]:
+    def _step(self, previous: Image, grey: Image, mask: NDArray[np.bool_] | None) -> NDArray[np.intp]:
         """Flow from the frame before, then re-alignment with the birth patches; returns the kept rows."""
         o = self.options
         old = self._xy
@@ -127,12 +125,24 @@ class FlowTracker:
         atlas = cv2.copyMakeBorder(atlas, 0, height - atlas.shape[0], 0, 0, cv2.BORDER_REPLICATE)
         padded = cv2.copyMakeBorder(grey, 0, height - grey.shape[0], 0, 0, cv2.BORDER_REPLICATE)
         aligned, status, _ = cv2.calcOpticalFlowPyrLK(
-            atlas, padded, centers, self._xy.copy(), winSize=(o.window_px, o.window_px), maxLevel=0,
-            criteria=_CRITERIA, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+            atlas,
+            padded,
+            centers,
+            self._xy.copy(),
+            winSize=(o.window_px, o.window_px),
+            maxLevel=0,
+            criteria=_CRITERIA,
+            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         )
         back, status_back, _ = cv2.calcOpticalFlowPyrLK(
-            padded, atlas, aligned, centers.copy(), winSize=(o.window_px, o.window_px), maxLevel=0,
-            criteria=_CRITERIA, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+            padded,
+            atlas,
+            aligned,
+            centers.copy(),
+            winSize=(o.window_px, o.window_px),
+            maxLevel=0,
+            criteria=_CRITERIA,
+            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         )
         good = (status[:, 0] == 1) & (status_back[:, 0] == 1)
         good &= np.linalg.norm(back - centers, axis=1) < o.realign_check_px
@@ -154,9 +164,7 @@ class FlowTracker:
         radius = max(4, round(0.4 * (w * h / o.max_tracks) ** 0.5))
         for x, y in self._xy.round().astype(int):
             cv2.circle(free, (int(x), int(y)), radius, 0, -1)
-        corners = cv2.goodFeaturesToTrack(
-            grey, 0, o.corner_quality, radius, mask=free, blockSize=5
-        )
+        corners = cv2.goodFeaturesToTrack(grey, 0, o.corner_quality, radius, mask=free, blockSize=5)
         if corners is None:
             return 0
         corners = _spread(corners[:, 0], room, grey.shape)
