@@ -1,0 +1,94 @@
+"""Estimation problems with exact truth, made from synthetic scenes, and how far a solution is from it."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pycolmap
+
+from factorsfm.camera import normalized_from_pixels
+from factorsfm.refinement import Observations, State
+from factorsfm.synthetic import synthetic_scene
+
+
+@dataclass(frozen=True)
+class Problem:
+    """The truth, with the first camera as the world and a median inverse distance of 1, and what was observed.
+
+    `points` (n, 3) are the Euclidean points of `truth` in its unit; `focal` and `noise_px` in pixels.
+    """
+
+    truth: State
+    points: np.ndarray
+    observations: Observations
+    focal: float
+    noise_px: float
+
+    @property
+    def frames(self):
+        return len(self.truth.rotation)
+
+    def of_frame(self, frame):
+        """Points (ids) that a frame observes and their normalised coordinates."""
+        mine = self.observations.frame == frame
+        return self.observations.point[mine], self.observations.xy[mine]
+
+    def depth(self, frame, ids):
+        return (self.points[ids] @ self.truth.rotation[frame].T + self.truth.translation[frame])[:, 2]
+
+
+def make_problem(motion, *, frames=10, points=100, parallax=0.05, noise_px=0.0, seed=0):
+    """Points seen by all frames of a `synthetic_scene`, in observations sorted by point."""
+    scene = synthetic_scene(motion, frames=frames, points=points, parallax=parallax, seed=seed)
+    seen = scene.observe(noise_px, seed)
+    everywhere = np.flatnonzero(np.bincount(np.concatenate([ids for ids, _ in seen])) == frames)
+    n = len(everywhere)
+    xy = np.stack([normalized_from_pixels(scene.camera, uv[np.isin(ids, everywhere)]) for ids, uv in seen], 1)
+    points = scene.points[everywhere]
+    unit = np.median(1 / np.linalg.norm(points, axis=1))
+    points = points * unit
+    distance = np.linalg.norm(points, axis=1)
+    focal = scene.camera.focal_length_x
+    truth = State(
+        rotation=np.array([pose.rotation.matrix() for pose in scene.cam_from_world]),
+        translation=np.array([pose.translation for pose in scene.cam_from_world]) * unit,
+        bearing=points / distance[:, None],
+        inverse_distance=1 / distance,
+        log_focal=np.log(focal),
+    )
+    observations = Observations(np.tile(np.arange(frames), n), np.repeat(np.arange(n), frames), xy.reshape(-1, 2))
+    return Problem(truth, points, observations, focal, noise_px)
+
+
+def rotation_matrices(vectors):
+    return np.array([pycolmap.Rotation3d(vector).matrix() for vector in np.reshape(vectors, (-1, 3))])
+
+
+def perturbed(state, seed=0, *, angle_rad=0.003, shift=0.01, structure=0.1):
+    """A start away from the truth; the first camera stays where it is."""
+    rng = np.random.default_rng([seed, 7])
+    turn = rotation_matrices(angle_rad * rng.standard_normal((len(state.rotation), 3)))
+    move = shift * rng.standard_normal(state.translation.shape)
+    turn[0], move[0] = np.eye(3), 0.0
+    bearing = state.bearing + 0.003 * rng.standard_normal(state.bearing.shape)
+    return replace(
+        state,
+        rotation=turn @ state.rotation,
+        translation=state.translation + move,
+        bearing=bearing / np.linalg.norm(bearing, axis=1, keepdims=True),
+        inverse_distance=state.inverse_distance * np.exp(structure * rng.standard_normal(len(state.bearing))),
+    )
+
+
+def in_unit_of(state, truth):
+    """The same solution with the median inverse distance relative to the truth brought to 1."""
+    unit = np.median(state.inverse_distance / truth.inverse_distance)
+    return replace(state, translation=state.translation * unit, inverse_distance=state.inverse_distance / unit)
+
+
+def angles_between(a, b):
+    """(k,) angles between rotations (radians), exact for small ones too."""
+    return np.linalg.norm(np.swapaxes(a, -1, -2) @ b - np.eye(3), axis=(-2, -1)) / np.sqrt(2)
+
+
+def centers(rotation, translation):
+    return -np.einsum("kji,kj->ki", rotation, translation)
