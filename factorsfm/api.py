@@ -70,7 +70,7 @@ def reconstruct(
     if stream is None:
         raise InputError(f"no frames in {source}")
     for name, folder in (("depth map", prior), ("mask", mask_prior)):
-        if isinstance(folder, DepthFolder | MaskFolder) and folder.matched == 0:
+        if isinstance(folder, DepthFolder | MaskFolder) and folder.asked and not folder.matched:
             raise InputError(f"no {name} in the given folder matches a frame of {source}")
     result = stream.finish(progress)
     result.seconds["total"] = time.perf_counter() - begin

@@ -9,7 +9,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import NoReturn, TextIO
+from typing import Any, NoReturn, TextIO
 
 from factorsfm import api, demo
 from factorsfm.camera import read_camera
@@ -67,7 +67,7 @@ def _reconstruct(arguments: argparse.Namespace, progress: _Progress) -> None:
     except ReconstructionError as error:
         given = {k: v for k, v in vars(arguments).items() if k not in ("command", "output", "verbose")}
         seconds = {"total": time.perf_counter() - start}
-        write_failure(arguments.output, str(error), getattr(error, "frames", ()), given, seconds)
+        write_failure(arguments.output, str(error), error.frames, given, seconds)
         raise
     progress("writing", 0, None)
     write_folder(reconstruction, arguments.output)
@@ -147,8 +147,10 @@ def _parser() -> argparse.ArgumentParser:
         epilog="Exit status: 0 done, 2 bad input, 3 the shot cannot be reconstructed, 130 interrupted.",
     )
     parser.add_argument("--version", action="version", version=f"factorsfm {program_version()}")
-    common = _Parser(add_help=False)
-    common.add_argument("-v", "--verbose", action="count", default=0, help="log what happens; twice: in every detail")
+    verbose: dict[str, Any] = {"action": "count", "help": "log what happens; twice: in every detail"}
+    parser.add_argument("-v", "--verbose", default=0, **verbose)
+    common = _Parser(add_help=False)  # without a default: it would overwrite what stands before the command
+    common.add_argument("-v", "--verbose", default=argparse.SUPPRESS, **verbose)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     reconstruct = commands.add_parser(

@@ -74,6 +74,7 @@ def run_demo(directory: str | Path, progress: Callable[[str, int, int | None], N
     estimate = pose_arrays([frame.cam_from_world for frame in reconstruction.frames])
     errors = trajectory_errors(*estimate, *truth)
     path_length = float(np.linalg.norm(np.diff(truth[1], axis=0), axis=1).sum())
+    reconstruction.options["source"] = "rendered shot"  # its file is gone
     write_folder(reconstruction, directory)
     if not cv2.imwrite(str(Path(directory) / "picture.png"), draw_picture(reconstruction)):
         raise InputError(f"cannot write the picture into {directory}")

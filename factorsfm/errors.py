@@ -1,5 +1,13 @@
 """Every error that the library raises on purpose: one root, one subclass per reason."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from factorsfm.reconstruction import FrameResult
+
 
 class FactorsfmError(Exception):
     """Root of all errors of this package; the message is one clear sentence for the user."""
@@ -14,4 +22,12 @@ class ModelError(InputError):
 
 
 class ReconstructionError(FactorsfmError):
-    """The input is fine but this shot cannot be reconstructed (command line: exit status 3)."""
+    """The input is fine but this shot cannot be reconstructed (command line: exit status 3).
+
+    Attributes:
+        frames: what became of every frame, as far as it is known.
+    """
+
+    def __init__(self, message: str, frames: Sequence[FrameResult] = ()) -> None:
+        super().__init__(message)
+        self.frames = tuple(frames)

@@ -4,8 +4,8 @@ Points are homogeneous, ``(m, w)`` with ``P = m / w``: ``w = 1`` is the Euclidea
 ``m`` with ``w = 1 / distance`` is the inverse-distance point of the polish. Everything starts from the camera-frame
 vector ``q = R m + w t``, so that the depth is ``q_z / w``.
 
-Pose derivatives use GTSAM's convention: ``world_from_cam`` is perturbed on the right by ``xi = (omega, v)``, which moves
-``q`` by ``q x omega - w v``.
+Pose derivatives use GTSAM's convention: ``world_from_cam`` is perturbed on the right by ``xi = (omega, v)``, which
+moves ``q`` by ``q x omega - w v``.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ VIRTUAL_BASELINE = 1e4
 
 def camera_points(rotation: Array, translation: Array, m: Array, w: Array) -> Array:
     """``q = R m + w t``: (n, 3). Rotation and translation (`cam_from_world`) broadcast over the points."""
-    return np.einsum("...ij,...j->...i", rotation, m) + w[..., None] * translation
+    return np.asarray(np.einsum("...ij,...j->...i", rotation, m) + w[..., None] * translation)
 
 
 def by_pose(by_q: Array, q: Array, w: Array) -> Array:

@@ -89,9 +89,9 @@ def start_pair(
     for i, a in enumerate(images):
         if a.depth is None:
             continue
-        valid = a.ids[a.depth.valid]
+        liftable = a.ids[a.depth.valid]
         for b in images[:i] + images[i + 1 :]:
-            count = int(np.isin(b.ids, valid, assume_unique=True).sum())
+            count = int(np.isin(b.ids, liftable, assume_unique=True).sum())
             if count > best_count:
                 best, best_count = (a, b), count
     if best is None or best_count < min_tracks:
@@ -99,7 +99,7 @@ def start_pair(
     a, b = best
     assert a.depth is not None
     points, valid = lift(a.xy, a.depth)
-    shared, in_a, in_b = np.intersect1d(a.ids, b.ids, assume_unique=True, return_indices=True)
+    _, in_a, in_b = np.intersect1d(a.ids, b.ids, assume_unique=True, return_indices=True)
     use = valid[in_a]
     result = register_image(
         points[in_a[use]],

@@ -368,7 +368,7 @@ class BundleAdjustment:
         point = normal.point.copy()
         diagonal = np.einsum("nii->ni", point)
         diagonal += damping * diagonal + 1e-12
-        point_covariance = np.linalg.inv(point)
+        point_covariance = np.asarray(np.linalg.inv(point), np.float64)
         root = np.linalg.cholesky(point_covariance)
         information = normal.camera.copy()
         information[np.diag_indices_from(information)] *= 1.0 + damping

@@ -21,7 +21,7 @@ from factorsfm.options import Options
 from factorsfm.polish import polish
 from factorsfm.priors.depth import DepthKind, DepthPrior
 from factorsfm.priors.masks import MaskPrior
-from factorsfm.reconstruction import FrameStatus, Reconstruction
+from factorsfm.reconstruction import FrameResult, FrameStatus, Reconstruction
 from factorsfm.registration import ImageDepth
 from factorsfm.result import assemble
 from factorsfm.tracks.flow import FlowTracker
@@ -138,13 +138,13 @@ class Stream:
         """
         mapper = self._mapper
         if mapper is None or len(self.frames) < 2:
-            raise ReconstructionError(f"{len(self.frames)} frames, at least 2 needed")
+            raise self._failure(f"{len(self.frames)} frames, at least 2 needed")
         with self._timed("mapping"):
             mapper.finish()
         registered = sum(image.registered for image in mapper.images)
         if registered < 2:
             worst = next((i for i in mapper.images if not i.registered), mapper.images[0])
-            raise ReconstructionError(
+            raise self._failure(
                 f"{registered} of {len(mapper.images)} frames registered, at least 2 needed; "
                 f"frame {self.frames[worst.tracks.position].index}: {worst.message}"
             )
@@ -181,6 +181,17 @@ class Stream:
         self._mapper = Mapper(focal, width, self.options, has_prior=self._depth is not None)
         return self._mapper
 
+    def _failure(self, message: str) -> ReconstructionError:
+        images = self._mapper.images if self._mapper is not None else []
+        frames = [
+            FrameResult(
+                frame.index, frame.name, frame.timestamp, image.status, image.message, _pose(image),
+                image.keyframe, len(image.tracks.ids), image.inliers,
+            )
+            for frame, image in zip(self.frames, images, strict=True)
+        ]  # fmt: skip
+        return ReconstructionError(message, frames)
+
     def _read_depth(self, frame: Frame, xy: NDArray[np.float64]) -> ImageDepth | None:
         assert self._depth is not None
         with self._timed("depth"):
@@ -216,7 +227,11 @@ class Stream:
 
 
 def _update(index: int, image: MappedImage) -> FrameUpdate:
-    pose = None
-    if image.rotation is not None:
-        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(image.rotation), image.translation)
-    return FrameUpdate(index, image.status, image.message, pose, image.keyframe, len(image.tracks.ids), image.inliers)
+    tracks = len(image.tracks.ids)
+    return FrameUpdate(index, image.status, image.message, _pose(image), image.keyframe, tracks, image.inliers)
+
+
+def _pose(image: MappedImage) -> pycolmap.Rigid3d | None:
+    if image.rotation is None:
+        return None
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(image.rotation), image.translation)

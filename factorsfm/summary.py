@@ -61,7 +61,7 @@ def failure_summary(
         "reason": reason,
         "source": options.get("source"),
         "frames": len(frames),
-        "registered": 0,
+        "registered": sum(frame.registered for frame in frames),
         "seconds": with_total(seconds),
         "statuses": [_frame_json(frame) for frame in frames],
         "options": options,

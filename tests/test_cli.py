@@ -5,6 +5,7 @@ import logging
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from test_export import build
@@ -165,6 +166,36 @@ def test_a_shot_that_cannot_be_reconstructed_leaves_the_reason(
     summary = json.loads((out / "summary.json").read_text())
     assert summary["reason"] == "12 tracks found, 30 needed"
     assert (summary["source"], summary["options"]["preset"]) == ("shot.mp4", "geometry")
+
+
+def test_a_black_shot_leaves_the_status_of_every_frame(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The reason is the footage, not the folder of depth maps that nothing asked."""
+    for folder in ("images", "depth"):
+        (tmp_path / folder).mkdir()
+    for k in range(4):
+        cv2.imwrite(str(tmp_path / "images" / f"{k}.png"), np.zeros((90, 160, 3), np.uint8))
+        np.save(tmp_path / "depth" / f"{k}.npy", np.ones((90, 160), np.float32))
+    arguments = ["--depth", str(tmp_path / "depth"), "--depth-kind", "inverse", "--output", str(tmp_path / "out")]
+    assert main(["reconstruct", str(tmp_path / "images"), *arguments]) == 3
+    assert_one_error_line(capsys.readouterr(), "0 of 4 frames registered", "contrast")
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert (summary["frames"], summary["registered"]) == (4, 0)
+    assert [status["name"] for status in summary["statuses"]] == ["0.png", "1.png", "2.png", "3.png"]
+    assert {status["status"] for status in summary["statuses"]} == {"blank"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "level"),
+    [([], logging.WARNING), (["-v"], logging.INFO), (["-vv"], logging.DEBUG)],
+)
+@pytest.mark.parametrize("before", [True, False])
+def test_verbose_stands_before_or_after_the_command(
+    tmp_path: Path, calls: list[dict[str, Any]], arguments: list[str], level: int, before: bool
+) -> None:
+    logging.getLogger().handlers.clear()  # else logging is taken as configured
+    command = ["reconstruct", "shot.mp4", "--output", str(tmp_path / "out")]
+    assert main([*arguments, *command] if before else [*command, *arguments]) == 0
+    assert logging.getLogger().level == level
 
 
 def test_interrupt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -208,7 +208,7 @@ class DepthFolder:
             logged. A 16-bit PNG of kind metric is in millimetres.
 
     Attributes:
-        matched: how many of the frames asked for had a map.
+        asked, matched: how many frames were asked for, and how many of these had a map.
 
     Raises:
         InputError: the folder is missing, holds no map, or its format cannot be read here.
@@ -217,7 +217,7 @@ class DepthFolder:
     def __init__(self, path: str | Path, kind: DepthKind | str | None = None) -> None:
         self._files = FrameFiles(Path(path), (".npy", ".npz", ".exr", ".png"), "depth maps")
         self.name = Path(path).name
-        self.matched = 0
+        self.asked = self.matched = 0
         suffix = self._files.suffix
         if suffix == ".exr" and not cv2.haveImageReader(str(self._files.first)):
             raise InputError(
@@ -235,6 +235,7 @@ class DepthFolder:
         Raises:
             InputError: the map cannot be read or has another aspect ratio than the frame.
         """
+        self.asked += 1
         path = self._files.find(frame)
         if path is None:
             return None

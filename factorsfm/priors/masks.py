@@ -45,7 +45,7 @@ class MaskFolder:
         margin: share of the image width by which the ignored area grows.
 
     Attributes:
-        matched: how many of the frames asked for had a mask.
+        asked, matched: how many frames were asked for, and how many of these had a mask.
 
     Raises:
         InputError: the folder is missing or holds no mask, or the margin is negative.
@@ -55,7 +55,7 @@ class MaskFolder:
         self._files = FrameFiles(Path(path), (".png", ".bmp", ".tif", ".tiff"), "masks")
         self._margin = _checked_margin(margin)
         self.name = Path(path).name
-        self.matched = 0
+        self.asked = self.matched = 0
 
     def __call__(self, frame: Frame) -> NDArray[np.bool_] | None:
         """The mask of a frame, None where the folder has none for it.
@@ -63,6 +63,7 @@ class MaskFolder:
         Raises:
             InputError: the mask cannot be read or has another aspect ratio than the frame.
         """
+        self.asked += 1
         path = self._files.find(frame)
         if path is None:
             return None

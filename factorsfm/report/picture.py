@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +17,7 @@ _PAGE, _CARD, _LINE = (244, 246, 246), (255, 255, 255), (224, 226, 225)
 _INK, _QUIET, _PATH, _CURVE = (33, 31, 29), (118, 111, 106), (15, 67, 209), (170, 105, 23)
 _RAMP = np.array([(60, 205, 250), (70, 130, 240), (115, 75, 205), (165, 60, 125), (190, 90, 60)], float)
 _SUBPIXEL = 4  # fractional bits of OpenCV's drawing coordinates
+_OVERSAMPLING = 4  # of the dots, which OpenCV draws as crosses at their own size
 _MAX_POINTS = 20_000
 
 
@@ -58,9 +61,11 @@ def _draw_view(
 
     order = np.argsort(-(view.points @ np.cross(right, down)))
     colors = _depth_colors(view.points[:, 2])
-    for (u, v), color in zip(project(view.points[order]), colors[order].tolist(), strict=True):
-        if 0 <= u < size[0] and 0 <= v < size[1]:
-            cv2.circle(image, _fixed(u, v), 22, color, -1, cv2.LINE_AA, _SUBPIXEL)
+    large = cv2.resize(image, None, fx=_OVERSAMPLING, fy=_OVERSAMPLING, interpolation=cv2.INTER_NEAREST)
+    for (u, v), color in zip(_OVERSAMPLING * project(view.points[order]), colors[order].tolist(), strict=True):
+        if 0 <= u < large.shape[1] and 0 <= v < large.shape[0]:
+            cv2.circle(large, (round(u), round(v)), round(1.4 * _OVERSAMPLING), color, -1)
+    image[:] = cv2.resize(large, image.shape[1::-1], interpolation=cv2.INTER_AREA)
     path = project(view.centers)
     fixed = np.round(path * 2**_SUBPIXEL).astype(np.int32)
     cv2.polylines(image, [fixed], False, _PATH, 2, cv2.LINE_AA, _SUBPIXEL)
@@ -69,12 +74,18 @@ def _draw_view(
 
 
 def _draw_scale_bar(image: NDArray[np.uint8], scale: float, unit: str) -> None:
-    goal = image.shape[1] / 6 / scale
-    power = 10.0 ** np.floor(np.log10(goal))
-    length = max(factor * power for factor in (1, 2, 5) if factor * power <= goal * 1.0001)
+    length = _round_length(float(image.shape[1] / 6 / scale))
     x, y = 14, image.shape[0] - 14
     cv2.line(image, (x, y), (x + round(length * scale), y), _QUIET, 1, cv2.LINE_AA)
+    if unit == "units" and length == 1:
+        unit = "unit"
     _text(image, f"{length:g} {unit}", (x, y - 8), 0.42, _QUIET)
+
+
+def _round_length(most: float) -> float:
+    """The largest of 1, 2 and 5 times a power of ten that is not above `most`."""
+    power = 10.0 ** math.floor(math.log10(most))
+    return max(factor * power for factor in (1.0, 2.0, 5.0) if factor * power <= most * 1.0001)
 
 
 def _draw_errors(image: NDArray[np.uint8], reconstruction: Reconstruction) -> None:
@@ -86,10 +97,10 @@ def _draw_errors(image: NDArray[np.uint8], reconstruction: Reconstruction) -> No
     highest = max(1.1 * float(errors[known].max()), 1e-3)
     x = left + (right - left) * np.arange(len(errors)) / max(len(errors) - 1, 1)
     y = bottom - (bottom - top) * errors / highest
-    for value in np.linspace(0, highest, 4):
+    for value in np.arange(0.0, highest, _round_length(highest / 2)):
         level = round(bottom - (bottom - top) * value / highest)
         cv2.line(image, (left, level), (right, level), _LINE, 1)
-        _text(image, f"{value:.2f}", (14, level + 4), 0.4, _QUIET)
+        _text(image, f"{value:.4g}", (14, level + 4), 0.4, _QUIET)
     for k in np.flatnonzero(known):
         if k + 1 < len(errors) and known[k + 1]:
             ends = _fixed(x[k], y[k]), _fixed(x[k + 1], y[k + 1])
@@ -97,8 +108,8 @@ def _draw_errors(image: NDArray[np.uint8], reconstruction: Reconstruction) -> No
         else:
             cv2.circle(image, _fixed(x[k], y[k]), 2 << _SUBPIXEL, _CURVE, -1, cv2.LINE_AA, _SUBPIXEL)
     frames = reconstruction.frames
-    for k in np.unique(np.linspace(0, len(frames) - 1, 9).astype(int)):
-        _text(image, str(frames[k].index), (round(x[k]) - 8, bottom + 18), 0.4, _QUIET)
+    for tick in range(0, len(frames), max(1, round(_round_length(len(frames) / 4)))):
+        _text(image, str(frames[tick].index), (round(x[tick]) - 8, bottom + 18), 0.4, _QUIET)
 
 
 def _depth_colors(depth: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -205,7 +205,7 @@ def _at(mask: NDArray[np.bool_], xy: Array) -> NDArray[np.bool_]:
     h, w = mask.shape
     x = np.clip(np.rint(xy[:, 0]).astype(int), 0, w - 1)
     y = np.clip(np.rint(xy[:, 1]).astype(int), 0, h - 1)
-    return mask[y, x]
+    return np.asarray(mask[y, x], bool)
 
 
 def _spread(corners: Array, count: int, shape: tuple[int, ...]) -> Array:
@@ -268,7 +268,7 @@ def _local_affine(old: Array, new: Array, shape: tuple[int, ...]) -> NDArray[np.
         bx, by = m0x / s1 - m0 / s1 * mx, m0y / s1 - m0 / s1 * my
         linear[:, row, 0] = (cyy * bx - cxy * by) / det / cell
         linear[:, row, 1] = (cxx * by - cxy * bx) / det / cell
-    return (np.eye(2) + linear[index]).astype(np.float32)
+    return np.asarray(np.eye(2) + linear[index], np.float32)
 
 
 def _warped_atlas(
