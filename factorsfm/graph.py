@@ -175,6 +175,8 @@ class FactorGraph:
         rotation, translation = camera_from_pose(estimate.atPose3(X(keyframe.position)))
         if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
             return "the pose is not finite"
+        if not len(keyframe.ids):
+            return "the keyframe observes no landmark"
         points = np.array([estimate.atPoint3(L(track)) for track in keyframe.ids.tolist()]).reshape(-1, 3)
         q = points @ rotation.T + translation
         front = q[:, 2] > 1e-6

@@ -303,14 +303,11 @@ TRIALS = 60
 
 def pose_errors(state, truth):
     """(6 (k - 1),) errors of all cameras but the first, which is the world, in the convention of the covariance."""
-    poses = [
-        [
-            pose_from_camera(rotation, translation)
-            for rotation, translation in zip(s.rotation, s.translation, strict=True)
-        ]
-        for s in (state, truth)
-    ]
-    return np.concatenate([estimate.localCoordinates(true) for estimate, true in list(zip(*poses, strict=True))[1:]])
+    errors = []
+    for k in range(1, len(truth.rotation)):
+        estimate = pose_from_camera(state.rotation[k], state.translation[k])
+        errors.append(estimate.localCoordinates(pose_from_camera(truth.rotation[k], truth.translation[k])))
+    return np.concatenate(errors)
 
 
 def normalised(error, covariance):
@@ -331,13 +328,10 @@ def assert_calibrated(trials, low=1.0, high=1.0):
     assert low * (1 - margin) < total / freedom < high * (1 + margin)
 
 
-# The kernel costs Gaussian noise some information (1.09 in variance at 2 standard deviations), and its weights understate
-# what is left (1.38): the covariance is on the safe side, by a factor of 0.79 with many observations.
-@pytest.mark.parametrize(("kernel", "low"), [(1e6, 1.0), (2.0, 0.79)])
-def test_the_covariance_is_calibrated(kernel, low):
+def test_the_covariance_is_calibrated():
     """Against errors of simulated problems; the weak prior of the points is a measurement like the others here."""
     errors = {"poses": [], "points": [], "affines": [], "field": []}
-    options = PolishOptions(kernel=kernel, tolerance=1e-6, point_sigma=0.1)
+    options = PolishOptions(kernel=1e6, tolerance=1e-5, point_sigma=0.1)
     for seed in range(TRIALS):
         problem = make_problem("handheld", frames=5, points=40, parallax=0.1, noise_px=0.3, seed=seed)
         prior, truth = with_prior(problem, [0, 2, 4], noise=0.03, smooth=0.05, seed=seed)
@@ -360,14 +354,18 @@ def test_the_covariance_is_calibrated(kernel, low):
         assert not camera[:6].any()
         assert not camera[columns].any()  # the focal length is fixed
     for trials in errors.values():
-        assert_calibrated(trials, low)
+        assert_calibrated(trials)
 
 
 @pytest.mark.parametrize("motion", ["truck", "dolly"])
 def test_the_covariance_is_calibrated_up_to_the_unit(motion):
-    """Geometry alone, default options: the unit of length is free, the weak prior of the points holds it loosely."""
+    """Geometry alone, default options: the unit of length is free, the weak prior of the points holds it loosely.
+
+    The robust kernel makes Gaussian errors 1.09 times as large in variance, and its weights predict 1.38 times: with
+    many observations the normalised error is 0.79, on the safe side.
+    """
     poses, points = [], []
-    for seed in range(TRIALS):
+    for seed in range(TRIALS // 2):
         problem = make_problem(motion, frames=5, points=40, parallax=0.1, noise_px=0.3, seed=seed)
         truth = problem.truth
         start = perturbed(truth, seed, angle_rad=0.001, shift=0.003)
