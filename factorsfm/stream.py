@@ -6,7 +6,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pycolmap
@@ -174,6 +174,7 @@ class Stream:
         height, width = frame.image.shape[:2]
         if self.camera is None:
             self.camera = guess_camera(width, height)
+            self.options = replace(self.options, refine_focal_length=True)
         self._focal_guessed = self.options.refine_focal_length
         check_camera(self.camera, width, height)
         self._size = (width, height)
