@@ -7,7 +7,7 @@ keyframes are a handful of independent measurements. The error of the prior is m
 
 with a smooth field ``e`` that belongs to the scene (shared by all images, exponential correlation over the viewing
 direction) and a local rest ``n``. Their sizes maximise the likelihood of the differences between the prior and the
-geometry, whose own joint covariance is known: where geometry is precise the differences show the network's error,
+geometry, whose own joint covariance is known, with a weak prior on what networks are usually like: where geometry is precise the differences show the network's error,
 where it is silent they say nothing and are not mistaken for precision.
 """
 
@@ -22,8 +22,10 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-_SMOOTH = np.geomspace(0.02, 1.5, 9)  # candidate standard deviations, in units of the median inverse depth
-_LOCAL = np.geomspace(0.01, 0.6, 8)
+_SMOOTH = np.geomspace(0.05, 2.0, 9)  # candidate standard deviations, in units of the median inverse depth
+_LOCAL = np.geomspace(0.05, 0.8, 7)
+# What networks are like where the shot itself says little: means and spread (factor) of log-normal priors.
+_USUAL_SMOOTH, _USUAL_LOCAL, _USUAL_FACTOR = 0.4, 0.15, 2.0
 _LENGTHS = (0.15, 0.5)  # candidate correlation lengths, in units of the extent of the scene's directions
 _SAMPLE = 200  # points on which the likelihood is evaluated
 _NODES = (12, 7)  # nodes of the field across and down
@@ -58,7 +60,7 @@ def sample_points(count: int, seed: int = 0) -> Index:
 
 
 def measure_weight(angles: Array, inverse_depth: Array, prior: Array, covariance: Array) -> PriorWeight:
-    """Maximum-likelihood error model from the points of a shot.
+    """Most probable error model given the points of a shot.
 
     Args:
         angles: (n, 2) directions; inverse_depth: (n,) from geometry, median about 1.
@@ -83,6 +85,8 @@ def measure_weight(angles: Array, inverse_depth: Array, prior: Array, covariance
             root = np.linalg.cholesky(total)
             white = np.linalg.solve(root, difference)
             score = -0.5 * float(white @ white) - float(np.log(root.diagonal()).sum())
+            usual = np.log([smooth / _USUAL_SMOOTH, local / _USUAL_LOCAL]) / np.log(_USUAL_FACTOR)
+            score -= 0.5 * float(usual @ usual)
             if score > best_score:
                 best, best_score = (float(smooth), float(local), share * extent), score
     certain = covariance.diagonal() < np.median(covariance.diagonal()) * 4.0
