@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.images import ImageTracks
 from factorsfm.refinement import Observations
 from factorsfm.registration import ImageDepth, register_image
 from factorsfm.triangulation import triangulate
@@ -17,23 +18,7 @@ Index = NDArray[np.int64]
 
 # A relative inverse depth of (almost) zero is a point at (almost) infinity; nothing is lifted farther than this.
 _FARTHEST = 20.0
-
-
-@dataclass(frozen=True, slots=True)
-class ImageTracks:
-    """What the mapper knows of an image: its tracks, and the depth prior at them where it has one.
-
-    Attributes:
-        position: index among the frames seen.
-        ids: (n,) identities of the tracks, ascending.
-        xy: (n, 2) undistorted normalised image coordinates.
-        depth: prior at the n keypoints.
-    """
-
-    position: int
-    ids: Index
-    xy: Array
-    depth: ImageDepth | None = None
+_FARTHEST_BASELINES = 1e5
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,7 +119,10 @@ def start_essential(
     )
     if essential is None or essential.shape != (3, 3):
         return NoStart(f"no essential matrix fits frames {first.position} and {second.position}")
-    _, rotation, translation, _ = cv2.recoverPose(essential, a, b, np.eye(3), mask=mask.copy())
+    # The default drops points beyond 50 baselines, which in these shots are all of them.
+    _, rotation, translation, *_ = cv2.recoverPose(
+        essential, a, b, np.eye(3), distanceThresh=_FARTHEST_BASELINES, mask=mask.copy()
+    )
     keep = mask.ravel() > 0
     n = int(keep.sum())
     observations = Observations(
