@@ -4,25 +4,19 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.factors import camera_points
-from factorsfm.graph import DepthMeasurements, FactorGraph, Keyframe
-from factorsfm.initialization import (
-    ImageTracks,
-    NoStart,
-    Start,
-    start_essential,
-    start_lifted,
-    start_pair,
-)
+from factorsfm.graph import FactorGraph, Keyframe
+from factorsfm.guidance import DepthGuidance
+from factorsfm.images import ImageTracks, MappedImage, gather, median_flow
+from factorsfm.initialization import NoStart, Start, start_essential, start_lifted, start_pair
 from factorsfm.options import Options
+from factorsfm.point_map import PointMap
 from factorsfm.reconstruction import FrameStatus
-from factorsfm.refinement import Observations, PriorObservations
-from factorsfm.registration import ImageDepth, Registration, fit_affine, register_image
+from factorsfm.registration import ImageDepth, Registration, register_image
 from factorsfm.triangulation import triangulate
 
 Array = NDArray[np.float64]
@@ -32,25 +26,6 @@ logger = logging.getLogger(__name__)
 
 _PAIR_WINDOW = 10  # images among which the paper's initial pair is sought
 _LIFT_PATIENCE = 10  # images without a usable depth map after which the start does without
-_SMALLEST_PRIOR_SIGMA = 0.05  # relative; no network is believed more than this
-
-
-@dataclass(slots=True)
-class MappedImage:
-    """An image and what is known of its pose."""
-
-    tracks: ImageTracks
-    status: FrameStatus
-    message: str
-    rotation: Array | None = None
-    translation: Array | None = None
-    keyframe: bool = False
-    inliers: int = 0
-    affine: tuple[float, float] | None = None
-
-    @property
-    def registered(self) -> bool:
-        return self.rotation is not None
 
 
 class Mapper:
@@ -74,7 +49,8 @@ class Mapper:
         )
         self._uses_keyframe_depth = has_prior and options.uses_depth
         self._started = False
-        self._points = np.full((1024, 3), np.nan)
+        self.points = PointMap()
+        self.guidance = DepthGuidance(self.options, self.points)
         self._waits_for_depth = 0
 
     # --- the algorithm ------------------------------------------------------------------------------------------
@@ -142,7 +118,7 @@ class Mapper:
         if len(waiting) < 2:
             return NoStart(f"{len(waiting)} of 2 needed images")
         first = waiting[0]
-        partners = waiting[-1:] if angle_deg > 0.0 else sorted(waiting[1:], key=lambda t: -_flow(first, t))[:5]
+        partners = waiting[-1:] if angle_deg > 0.0 else sorted(waiting[1:], key=lambda t: -median_flow(first, t))[:5]
         start: Start | NoStart = NoStart("no partner")
         for second in partners:
             start = start_essential(
@@ -166,7 +142,7 @@ class Mapper:
                 image.message = start.reason
             return
         self._started = True
-        self._set_points(start.ids, start.points)
+        self.points.set(start.ids, start.points)
         waiting = self._waiting()
         for position, rotation, translation in zip(start.images, start.rotation, start.translation, strict=True):
             image = next(i for i in waiting if i.tracks.position == position)
@@ -175,7 +151,7 @@ class Mapper:
         # Next image as COLMAP chooses it: the one that sees most of the map.
         remaining = [image for image in waiting if not image.registered]
         while remaining:
-            image = max(remaining, key=lambda i: int(self._mapped(i.tracks.ids).sum()))
+            image = max(remaining, key=lambda i: int(self.points.contains(i.tracks.ids).sum()))
             remaining.remove(image)
             self._register(image)
             if image.registered and self._is_keyframe(image):
@@ -187,22 +163,19 @@ class Mapper:
         """PnP on the mapped tracks, then refinement with the depth prior where the options say so."""
         o = self.options
         tracks = image.tracks
-        mapped = self._mapped(tracks.ids)
+        mapped = self.points.contains(tracks.ids)
         if mapped.sum() < o.min_inliers:
             image.status = FrameStatus.TOO_FEW_TRACKS
             image.message = f"{mapped.sum()} of {o.min_inliers} needed tracks have a point in the map"
             return
-        near = min((i for i in self.images if i.registered), key=lambda i: abs(i.tracks.position - tracks.position))
-        assert near.rotation is not None
-        assert near.translation is not None
+        near = self._nearest_registered(tracks.position)
         depth = None
         if o.registration_depth != "none" and tracks.depth is not None:
             depth = _select(tracks.depth, mapped)
         result = register_image(
-            self._points[tracks.ids[mapped]],
+            self.points.at(tracks.ids[mapped]),
             tracks.xy[mapped],
-            near.rotation,
-            near.translation,
+            *near.pose,
             focal=self.focal,
             sigma=o.pixel_sigma,
             inlier_px=o.inlier_px,
@@ -218,6 +191,13 @@ class Mapper:
         inliers = np.zeros(len(tracks.ids), bool)
         inliers[np.nonzero(mapped)[0][result.inliers]] = True
         self._accept(image, replace(result, inliers=inliers))
+
+    def _nearest_registered(self, position: int) -> MappedImage:
+        for offset in range(1, len(self.images)):
+            for other in (position - offset, position + offset):
+                if 0 <= other < len(self.images) and self.images[other].registered:
+                    return self.images[other]
+        raise ValueError("no image is registered")
 
     def _accept(self, image: MappedImage, result: Registration) -> None:
         image.rotation, image.translation = result.rotation, result.translation
@@ -237,7 +217,7 @@ class Mapper:
         return (
             abs(image.tracks.position - last.position) >= self.options.keyframe_interval
             or shared < 0.7 * len(last.ids)
-            or _flow(image.tracks, last) * self.focal > self.options.keyframe_flow * self.width
+            or median_flow(image.tracks, last) * self.focal > self.options.keyframe_flow * self.width
         )
 
     def _add_keyframe(self, image: MappedImage, read_depth: Callable[[], ImageDepth | None] | None) -> None:
@@ -248,10 +228,8 @@ class Mapper:
                 self._waits_for_depth += 1  # the next image may have a map
                 return
             self._waits_for_depth = 0
-        assert image.rotation is not None
-        assert image.translation is not None
         tracks = image.tracks
-        self._fit_affine(image)
+        self.guidance.fit(image)
         known = np.isin(tracks.ids, self.graph.landmarks, assume_unique=True) & self._explained(image)
         new_ids, new_points = self._new_landmarks(image, known)
         used = known | np.isin(tracks.ids, new_ids, assume_unique=True)
@@ -259,11 +237,10 @@ class Mapper:
             return
         keyframe = Keyframe(
             tracks.position,
-            image.rotation,
-            image.translation,
+            *image.pose,
             tracks.ids[used],
             tracks.xy[used],
-            self._depth_measurements(image, used),
+            self.guidance.measurements(image, used, len(self.graph.keyframes)),
         )
         earlier = []
         for position in self.graph.keyframes:
@@ -275,10 +252,19 @@ class Mapper:
         if not result.committed:
             return
         image.keyframe = True
-        self._set_points(*self.graph.points())
+        self.points.set(*self.graph.points())
         for position, (rotation, translation) in self.graph.poses().items():
             self.images[position].rotation, self.images[position].translation = rotation, translation
         image.affine = self.graph.affine(tracks.position) or image.affine
+
+    def _explained(self, image: MappedImage) -> NDArray[np.bool_]:
+        """Which tracks have a point that projects where it was seen, within the widened inlier threshold."""
+        mapped = self.points.contains(image.tracks.ids)
+        error = self.points.reprojection_errors(image, mapped) * self.focal
+        limit = max(self.options.inlier_px, 5.0 * float(np.median(error)) if len(error) else 0.0)
+        explained = mapped.copy()
+        explained[mapped] = error < limit
+        return explained
 
     def _new_landmarks(self, image: MappedImage, known: NDArray[np.bool_]) -> tuple[Index, Array]:
         """Tracks that become landmarks: well spread, triangulated from the keyframes that see them."""
@@ -287,7 +273,7 @@ class Mapper:
         candidates = ~np.isin(image.tracks.ids, self.graph.landmarks, assume_unique=True)
         keyframes = [self.images[k] for k in self.graph.keyframes] + [image]
         if len(keyframes) == 1:  # the start: its points are there already
-            candidates &= self._mapped(image.tracks.ids)
+            candidates &= self.points.contains(image.tracks.ids)
         else:
             seen = np.concatenate([k.tracks.ids for k in keyframes[:-1]])
             candidates &= np.isin(image.tracks.ids, seen)
@@ -296,173 +282,20 @@ class Mapper:
         chosen = _spread(image.tracks.xy, known, np.nonzero(candidates)[0], room)
         ids = np.sort(image.tracks.ids[chosen])
         if len(keyframes) == 1:
-            return ids, self._points[ids]
+            return ids, self.points.at(ids)
         return self._triangulate(keyframes, ids)
 
     def _triangulate(self, keyframes: list[MappedImage], ids: Index) -> tuple[Index, Array]:
         o = self.options
-        frame, point, xy = [], [], []
-        for k, image in enumerate(keyframes):
-            seen = np.nonzero(np.isin(image.tracks.ids, ids, assume_unique=True))[0]
-            frame.append(np.full(len(seen), k))
-            point.append(np.searchsorted(ids, image.tracks.ids[seen]))
-            xy.append(image.tracks.xy[seen])
-        order = np.lexsort((np.concatenate(frame), np.concatenate(point)))
-        observations = Observations(
-            np.concatenate(frame)[order], np.concatenate(point)[order], np.concatenate(xy)[order]
-        )
         rotation = np.array([k.rotation for k in keyframes])
         translation = np.array([k.translation for k in keyframes])
-        affine, prior = self._triangulation_prior(keyframes, ids)
+        affine, prior = self.guidance.at_observations(keyframes, ids)
         result = triangulate(
-            rotation, translation, observations, focal=self.focal, inlier_px=o.inlier_px, sigma=o.pixel_sigma,
-            fallback=self._fallback(keyframes[-1], ids), affine=affine, prior=prior,
+            rotation, translation, gather(keyframes, ids), focal=self.focal, inlier_px=o.inlier_px, sigma=o.pixel_sigma,
+            fallback=self.guidance.fallback(keyframes[-1], ids), affine=affine, prior=prior,
         )  # fmt: skip
         good = (result.inliers >= 2) & (result.inverse_distance > 1e-6)
         return ids[good], result.bearing[good] / result.inverse_distance[good, None]
-
-    def _fallback(self, image: MappedImage, ids: Index) -> Array:
-        """(n,) inverse distances for tracks whose views leave it open: the image's prior, else the map's median."""
-        mapped = self._mapped(image.tracks.ids)
-        inverse = self._inverse_depths(image, mapped)
-        typical = float(np.median(inverse)) if len(inverse) else 1.0
-        fallback = np.full(len(ids), typical)
-        depth = image.tracks.depth
-        if depth is not None and image.affine is not None and self.options.triangulation_depth != "none":
-            at = np.searchsorted(image.tracks.ids, ids)
-            use = depth.valid[at]
-            scale, shift = image.affine
-            guess = (depth.inverse_depth[at] - shift) / scale
-            if self.options.triangulation_depth == "paper" and self.options.registration_depth == "paper":
-                guess = 1.0 / np.maximum(scale / depth.inverse_depth[at] + shift, 1e-3)
-            fallback[use] = np.clip(guess[use], 0.1 * typical, 10.0 * typical)
-        return fallback
-
-    def _triangulation_prior(
-        self, keyframes: list[MappedImage], ids: Index
-    ) -> tuple[Array | None, PriorObservations | None]:
-        """The prior at the observations of `ids`, scale and shift fixed as registration left them."""
-        if self.options.triangulation_depth == "none":
-            return None, None
-        images = [(k, i) for k, i in enumerate(keyframes) if i.tracks.depth is not None and i.affine is not None]
-        parts: list[tuple[Array, ...]] = []
-        for row, (k, image) in enumerate(images):
-            depth = image.tracks.depth
-            assert depth is not None
-            assert image.affine is not None
-            seen = np.nonzero(np.isin(image.tracks.ids, ids, assume_unique=True) & depth.valid)[0]
-            value = depth.inverse_depth[seen]
-            if self.options.triangulation_depth == "paper":
-                # gamma D + beta with lambda, to first order in the inverse depth
-                target = np.maximum(image.affine[0] / value + image.affine[1], 1e-3)
-                value, sigma = 1.0 / target, 1.0 / target**2 / np.sqrt(self.options.depth_weight)
-            else:
-                sigma = np.full(len(seen), self._prior_sigma(image, len(images)))
-            n = len(seen)
-            at = np.searchsorted(ids, image.tracks.ids[seen])
-            parts.append((np.full(n, row), np.full(n, k), at, value, sigma))
-        if not parts or not sum(len(p[0]) for p in parts):
-            return None, None
-        image_row, frame, point, value, sigma = (np.concatenate(c) for c in zip(*parts, strict=True))
-        order = np.argsort(point, kind="stable")
-        m = len(order)
-        prior = PriorObservations(
-            image_row[order], frame[order], point[order], value[order], sigma[order],
-            np.zeros((m, 4), np.int64), np.zeros((m, 4)), np.eye(1), 1.0, 1.0,
-        )  # fmt: skip
-        paper = self.options.triangulation_depth == "paper"
-        affine = np.array([(1.0, 0.0) if paper else i.affine for _, i in images])
-        return affine, prior
-
-    # --- the prior ----------------------------------------------------------------------------------------------
-
-    def _fit_affine(self, image: MappedImage) -> None:
-        """Scale and shift of a keyframe from the mapped points it sees."""
-        depth = image.tracks.depth
-        if depth is None or image.affine is not None:
-            return
-        use = self._mapped(image.tracks.ids) & depth.valid
-        inverse = self._inverse_depths(image, use)
-        positive = inverse > 1e-6
-        if positive.sum() >= 10:
-            measured = depth.inverse_depth[use][positive]
-            if self.options.registration_depth == "paper":
-                image.affine = fit_affine(1.0 / measured, 1.0 / inverse[positive])[:2]
-            else:
-                image.affine = fit_affine(inverse[positive], measured)[:2]
-
-    def _prior_sigma(self, image: MappedImage, keyframes: int) -> float:
-        """Standard deviation of the prior in the live graph.
-
-        The robust spread of its residuals, inflated by the number of keyframes that repeat the same error.
-        """
-        depth = image.tracks.depth
-        assert depth is not None
-        assert image.affine is not None
-        use = self._mapped(image.tracks.ids) & depth.valid
-        inverse = self._inverse_depths(image, use)
-        spread = 0.3
-        if len(inverse) >= 10:
-            residual = image.affine[0] * inverse + image.affine[1] - depth.inverse_depth[use]
-            spread = 1.4826 * float(np.median(np.abs(residual)))
-        return max(spread, _SMALLEST_PRIOR_SIGMA) * float(np.sqrt(1.0 + keyframes))
-
-    def _depth_measurements(self, image: MappedImage, used: NDArray[np.bool_]) -> DepthMeasurements | None:
-        depth = image.tracks.depth
-        if not self.options.graph_depth or depth is None or image.affine is None:
-            return None
-        use = used & depth.valid
-        if use.sum() < 10:
-            return None
-        sigma = self._prior_sigma(image, len(self.graph.keyframes))
-        return DepthMeasurements(
-            image.tracks.ids[use], depth.inverse_depth[use], np.full(int(use.sum()), sigma), image.affine
-        )
-
-    # --- the map ------------------------------------------------------------------------------------------------
-
-    def _mapped(self, ids: Index) -> NDArray[np.bool_]:
-        inside = ids < len(self._points)
-        mapped = np.zeros(len(ids), bool)
-        mapped[inside] = np.isfinite(self._points[ids[inside], 0])
-        return mapped
-
-    def _set_points(self, ids: Index, points: Array) -> None:
-        while len(ids) and ids.max() >= len(self._points):
-            self._points = np.concatenate([self._points, np.full_like(self._points, np.nan)])
-        self._points[ids] = points
-
-    def map_points(self) -> tuple[Index, Array]:
-        """Track ids and positions of all points of the map."""
-        ids = np.nonzero(np.isfinite(self._points[:, 0]))[0]
-        return ids, self._points[ids]
-
-    def _inverse_depths(self, image: MappedImage, mapped: NDArray[np.bool_]) -> Array:
-        points = self._points[image.tracks.ids[mapped]]
-        assert image.rotation is not None
-        assert image.translation is not None
-        z = camera_points(image.rotation, image.translation, points, np.ones(len(points)))[:, 2]
-        return np.where(z > 1e-6, 1.0 / np.maximum(z, 1e-6), 0.0)
-
-    def _explained(self, image: MappedImage) -> NDArray[np.bool_]:
-        """Which tracks have a point that projects where it was seen, within the widened inlier threshold."""
-        mapped = self._mapped(image.tracks.ids)
-        points = self._points[image.tracks.ids[mapped]]
-        assert image.rotation is not None
-        assert image.translation is not None
-        q = camera_points(image.rotation, image.translation, points, np.ones(len(points)))
-        z = np.where(q[:, 2] > 1e-6, q[:, 2], np.nan)
-        error = np.linalg.norm(q[:, :2] / z[:, None] - image.tracks.xy[mapped], axis=1) * self.focal
-        limit = max(self.options.inlier_px, 5.0 * float(np.nanmedian(error)) if len(error) else 0.0)
-        explained = mapped.copy()
-        explained[mapped] = error < limit
-        return explained
-
-
-def _flow(a: ImageTracks, b: ImageTracks) -> float:
-    """Median displacement of the shared tracks, normalised image coordinates."""
-    _, in_a, in_b = np.intersect1d(a.ids, b.ids, assume_unique=True, return_indices=True)
-    return float(np.median(np.linalg.norm(a.xy[in_a] - b.xy[in_b], axis=1))) if len(in_a) else float("inf")
 
 
 def _select(depth: ImageDepth, index: NDArray[np.bool_]) -> ImageDepth:

@@ -85,6 +85,7 @@ class PolishOptions:
         kernel: scale of the Cauchy kernel in standard deviations.
         min_track_length: frames in which a track must be seen.
         point_sigma: weak prior of every inverse distance around its start, in units of the scene's median.
+        max_frames: frames that are variables; in a longer shot the others are registered on the polished points.
         outlier_sigmas: tracks beyond this many robust standard deviations of all tracks are removed.
     """
 
@@ -96,6 +97,7 @@ class PolishOptions:
     min_track_length: int = 5
     point_sigma: float = 1.0
     outlier_sigmas: float = 5.0
+    max_frames: int = 400
 
 
 @dataclass(frozen=True, slots=True)

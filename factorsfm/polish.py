@@ -9,13 +9,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.mapper import MappedImage
+from factorsfm.images import MappedImage, gather
 from factorsfm.observability import Motion, classify_motion
 from factorsfm.options import Options, PolishOptions
-from factorsfm.prior_weight import PriorWeight, direction_angles, field_grid, measure_weight, sample_points
+from factorsfm.prior_term import PriorPart, joint_problem, weigh_prior
 from factorsfm.reconstruction import ShotKind
-from factorsfm.refinement import BundleAdjustment, Observations, PriorObservations, State
-from factorsfm.registration import fit_affine
+from factorsfm.refinement import BundleAdjustment, Observations, State
+from factorsfm.registration import register_image
 from factorsfm.triangulation import triangulate
 
 Array = NDArray[np.float64]
@@ -29,27 +29,6 @@ _RAYLEIGH_MEDIAN = 1.1774  # median of the norm of a 2-D error, in standard devi
 _CORE_TRACKS = 400  # tracks with which the cameras converge first
 _TRIANGULATION_VIEWS = 10
 _FOCAL_STD = 0.05  # relative standard deviation up to which a focal length counts as determined
-_LEAST_CORRELATION = 0.1  # with the reconstructed inverse depth; below this, or mirrored, a prior is none
-_SCALE_SIGMA, _SHIFT_SIGMA, _NO_SHIFT_SIGMA = 0.5, 0.3, 0.02
-
-
-@dataclass(slots=True)
-class PriorPart:
-    """What the prior did.
-
-    Attributes:
-        weight: its measured error model.
-        images: (p,) rows of the frames that carry it.
-        observations: its values; residual: (m,) in units of its inverse depth.
-        scale_std, shift_std: (p,) of the affines.
-    """
-
-    weight: PriorWeight
-    images: Index
-    observations: PriorObservations
-    residual: Array
-    scale_std: Array
-    shift_std: Array
 
 
 @dataclass(slots=True)
@@ -90,7 +69,8 @@ def polish(
         focal: pixels, a first guess where the options refine it.
     """
     o = options.polish
-    frames = [i for i, image in enumerate(images) if image.registered]
+    registered = [i for i, image in enumerate(images) if image.registered]
+    frames = _solved_frames(images, registered, o.max_frames)
     used = [images[i] for i in frames]
     observations, tracks = _gather(used, min(o.min_track_length, max(2, len(used))))
     state = _first_guess(used, observations, tracks, map_points, focal)
@@ -101,10 +81,11 @@ def polish(
     if options.refine_focal_length:
         adjustment, focal_std = _checked_focal(adjustment, few, o, focal)
     motion = classify_motion(adjustment, few, o)
+    inflation = _temporal_inflation(adjustment, few)
     weighed = None
     if motion.kind is ShotKind.GENERAL:
         if o.depth:
-            weighed = _weigh_prior(adjustment, few, tracks[core], used)
+            weighed = weigh_prior(adjustment, few, tracks[core], used, inflation)
         part = adjustment.state
     else:
         part = motion.rotation_only
@@ -117,10 +98,13 @@ def polish(
     observations, tracks, state = _without_outliers(state, observations, tracks, sigma, o)
     progress("polish: all tracks")
     prior = None
+    # Pixel errors that repeat themselves from frame to frame weigh less; the kernel keeps its width in pixels.
+    wide = float(np.sqrt(inflation))
+    final = replace(o, kernel=o.kernel / wide)
     if weighed is not None:
-        adjustment, prior = _joint(state, observations, tracks, used, weighed, sigma, o)
+        adjustment, prior = joint_problem(state, observations, tracks, used, weighed, sigma * wide, final)
     else:
-        adjustment = BundleAdjustment(state, observations, o, sigma=sigma, free_translation=free)
+        adjustment = BundleAdjustment(state, observations, final, sigma=sigma * wide, free_translation=free)
     adjustment.solve(o.final_iterations)
     if prior is not None:
         prior.residual = adjustment.prior_residuals()
@@ -130,10 +114,14 @@ def polish(
     if prior is not None:
         affine = np.sqrt(camera_covariance.diagonal()[6 * k + 1 : 6 * k + 1 + 2 * len(prior.images)])
         prior.scale_std, prior.shift_std = affine[::2], affine[1::2]
-    return Polished(
-        frames, adjustment.state, tracks, observations, adjustment.reprojection_errors(), adjustment.sigma,
+    result = Polished(
+        frames, adjustment.state, tracks, observations, adjustment.reprojection_errors(), sigma,
         motion, poses, prior, focal_std,
     )  # fmt: skip
+    if len(frames) < len(registered):
+        progress("polish: frames between")
+        _add_frames_between(result, images, registered, options)
+    return result
 
 
 # --- set-up -----------------------------------------------------------------------------------------------------
@@ -141,15 +129,9 @@ def polish(
 
 def _gather(images: list[MappedImage], min_length: int) -> tuple[Observations, Index]:
     """Observations of all tracks that are long enough, sorted by track, and the tracks' ids."""
-    frame = np.concatenate([np.full(len(i.tracks.ids), k) for k, i in enumerate(images)])
-    track = np.concatenate([i.tracks.ids for i in images])
-    xy = np.concatenate([i.tracks.xy for i in images])
-    ids, point, count = np.unique(track, return_inverse=True, return_counts=True)
-    keep = count[point] >= min_length
-    frame, point, xy = frame[keep], point[keep], xy[keep]
-    kept, point = np.unique(point, return_inverse=True)
-    order = np.lexsort((frame, point))
-    return Observations(frame[order], point[order], xy[order]), ids[kept]
+    ids, count = np.unique(np.concatenate([i.tracks.ids for i in images]), return_counts=True)
+    ids = ids[count >= min_length]
+    return gather(images, ids), ids
 
 
 def _first_guess(
@@ -161,12 +143,11 @@ def _first_guess(
 ) -> State:
     """Poses in the first camera's frame, points triangulated from a few views, median inverse distance 1."""
     first = images[0]
-    assert first.rotation is not None
-    assert first.translation is not None
-    turn = np.array([i.rotation for i in images]) @ first.rotation.T
-    translation = np.array([i.translation for i in images]) - turn @ first.translation
+    rotation, origin = first.pose
+    turn = np.array([i.rotation for i in images]) @ rotation.T
+    translation = np.array([i.translation for i in images]) - turn @ origin
     ids, points = map_points
-    points = points @ first.rotation.T + first.translation
+    points = points @ rotation.T + origin
     distance = np.linalg.norm(points, axis=1)
     unit = float(np.median(1.0 / np.maximum(distance, 1e-6)))
     translation = translation * unit
@@ -174,7 +155,8 @@ def _first_guess(
     few = np.isin(observations.frame, views)
     first_of_track = np.zeros(len(few), bool)
     first_of_track[np.searchsorted(observations.point, np.arange(len(tracks)))] = True
-    some = Observations(*(a[few | first_of_track] for a in (observations.frame, observations.point, observations.xy)))
+    keep = few | first_of_track
+    some = Observations(observations.frame[keep], observations.point[keep], observations.xy[keep])
     result = triangulate(
         turn,
         translation,
@@ -293,114 +275,58 @@ def _temporal_inflation(adjustment: BundleAdjustment, observations: Observations
     return (1.0 + correlation) / (1.0 - correlation)
 
 
-@dataclass(frozen=True, slots=True)
-class _Weighed:
-    """The prior's error model, the affines that go with it, and the correlation of the pixel errors in time."""
-
-    weight: PriorWeight
-    rows: Index
-    scale: Array
-    shift: Array
-    inflation: float
+# --- long shots -------------------------------------------------------------------------------------------------
 
 
-def _weigh_prior(
-    adjustment: BundleAdjustment, observations: Observations, tracks: Index, images: list[MappedImage]
-) -> _Weighed | None:
-    """Measure how far the prior can be trusted on this shot; None where there is none or it is no prior."""
-    values = _prior_values(images, observations, tracks)
-    if values is None:
-        return None
-    point = observations.point[values.at]
-    state = adjustment.state
-    q = state.camera_points(observations.frame[values.at], point)
-    predicted = state.inverse_distance[point] / np.maximum(q[:, 2], 1e-6)
-    scale, shift = np.ones(len(values.rows)), np.zeros(len(values.rows))
-    for i in range(len(values.rows)):
-        mine = values.image == i
-        scale[i], shift[i], _ = fit_affine(predicted[mine], values.inverse_depth[mine], free_shift=values.free_shift)
-    # One value per point: its images repeat the same error.
-    seen, index, count = np.unique(point, return_inverse=True, return_counts=True)
-    said = np.bincount(index, (values.inverse_depth - shift[values.image]) / scale[values.image]) / count
-    mean_predicted = np.bincount(index, predicted) / count
-    sample = sample_points(len(seen))
-    inflation = _temporal_inflation(adjustment, observations)
-    _, covariance = adjustment.covariance(seen[sample])
-    angles = direction_angles(state.bearing[seen[sample]])
-    weight = measure_weight(angles, mean_predicted[sample], said[sample], covariance * inflation)
-    logger.info(
-        "prior: smooth error %.2f, local %.3f of the median inverse depth, correlation %.2f; inflation %.1f",
-        weight.smooth, weight.local, weight.correlation, inflation,
-    )  # fmt: skip
-    if weight.correlation < _LEAST_CORRELATION:
-        return None
-    return _Weighed(weight, values.rows, scale, shift, inflation)
+def _solved_frames(images: list[MappedImage], registered: list[int], limit: int) -> list[int]:
+    """The frames that are variables of the polish: all, or in a long shot the keyframes and others between them."""
+    if len(registered) <= limit:
+        return registered
+    keyframes = [i for i in registered if images[i].keyframe]
+    if len(keyframes) > limit:
+        return [keyframes[k] for k in np.linspace(0, len(keyframes) - 1, limit).astype(int)]
+    others = [i for i in registered if not images[i].keyframe]
+    fill = [others[k] for k in np.linspace(0, len(others) - 1, limit - len(keyframes)).astype(int)]
+    return sorted(keyframes + fill)
 
 
-def _joint(
-    state: State,
-    observations: Observations,
-    tracks: Index,
-    images: list[MappedImage],
-    weighed: _Weighed,
-    sigma: float,
-    options: PolishOptions,
-) -> tuple[BundleAdjustment, PriorPart]:
-    """The final problem: all tracks, and the prior at its weight."""
-    values = _prior_values(images, observations, tracks)
-    assert values is not None
-    point = observations.point[values.at]
-    nodes, node_weights, information, rest = field_grid(direction_angles(state.bearing), weighed.weight)
-    count = np.bincount(point, minlength=len(tracks))[point]
-    prior = PriorObservations(
-        values.image, observations.frame[values.at], point, values.inverse_depth,
-        rest[point] * weighed.scale[values.image] * np.sqrt(count),
-        nodes[point], node_weights[point], information, _SCALE_SIGMA,
-        _SHIFT_SIGMA if values.free_shift else _NO_SHIFT_SIGMA,
-    )  # fmt: skip
-    state = replace(state, scale=weighed.scale, shift=weighed.shift, field=np.zeros(len(information)))
-    # Pixel errors that repeat themselves weigh less against the prior; the kernel keeps its width in pixels.
-    wide = float(np.sqrt(weighed.inflation))
-    options = replace(options, kernel=options.kernel / wide)
-    joint = BundleAdjustment(state, observations, options, sigma=sigma * wide, prior=prior)
-    none = np.zeros(0)
-    return joint, PriorPart(weighed.weight, values.rows, prior, none, none, none)
-
-
-@dataclass(frozen=True, slots=True)
-class _PriorValues:
-    """Rows of the frames with a prior; and per value its image, its observation and the inverse depth."""
-
-    rows: Index
-    image: Index
-    at: Index
-    inverse_depth: Array
-    free_shift: bool
-
-
-def _prior_values(images: list[MappedImage], observations: Observations, tracks: Index) -> _PriorValues | None:
-    """Values of the prior at the observations, sorted as these; None where no frame carries any."""
-    rows, image, at, value = [], [], [], []
-    order = np.lexsort((observations.point, observations.frame))
-    start = np.searchsorted(observations.frame[order], np.arange(len(images) + 1))
-    for row, mapped in enumerate(images):
-        depth = mapped.tracks.depth
-        if depth is None:
+def _add_frames_between(result: Polished, images: list[MappedImage], registered: list[int], options: Options) -> None:
+    """Register the frames that were left out on the polished points."""
+    state, m = result.state, options.mapper
+    focal = float(np.exp(state.log_focal))
+    solved = np.array(result.frames)
+    points = state.points
+    poses = {f: (state.rotation[k], state.translation[k]) for k, f in enumerate(result.frames)}
+    for f in registered:
+        if f in poses:
             continue
-        here = order[start[row] : start[row + 1]]
-        own = np.searchsorted(mapped.tracks.ids, tracks[observations.point[here]])
-        good = depth.valid[own]
-        if depth.valid.sum() < 20 or not good.any():
+        tracks = images[f].tracks
+        _, mine, theirs = np.intersect1d(tracks.ids, result.tracks, assume_unique=True, return_indices=True)
+        if len(mine) < m.min_inliers:
             continue
-        image.append(np.full(int(good.sum()), len(rows)))
-        rows.append(row)
-        at.append(here[good])
-        value.append(depth.inverse_depth[own][good])
-    if not rows:
-        return None
-    flat = np.concatenate(at)
-    by_point = np.argsort(flat, kind="stable")
-    free_shift = all(images[r].tracks.depth.free_shift for r in rows)  # type: ignore[union-attr]
-    return _PriorValues(
-        np.array(rows), np.concatenate(image)[by_point], flat[by_point], np.concatenate(value)[by_point], free_shift
-    )  # fmt: skip
+        near = int(solved[np.argmin(np.abs(solved - f))])
+        found = register_image(
+            points[theirs], tracks.xy[mine], *poses[near],
+            focal=focal, sigma=max(result.sigma, _SMALLEST_SIGMA_PX), inlier_px=m.inlier_px,
+        )  # fmt: skip
+        if found.inliers.sum() >= m.min_inliers:
+            poses[f] = found.rotation, found.translation
+    frames = sorted(poses)
+    row = {f: k for k, f in enumerate(frames)}
+    nearest = np.argmin(np.abs(np.array(frames)[:, None] - solved), axis=1)
+    result.state = replace(
+        state,
+        rotation=np.array([poses[f][0] for f in frames]),
+        translation=np.array([poses[f][1] for f in frames]),
+    )
+    result.covariance = result.covariance[nearest]
+    if result.prior is not None:
+        new_row = np.array([row[f] for f in result.frames])
+        p = result.prior
+        p.images = new_row[p.images]
+        p.observations = replace(p.observations, frame=new_row[p.observations.frame])
+    result.frames = frames
+    result.observations = gather([images[f] for f in frames], result.tracks)
+    result.errors = BundleAdjustment(
+        result.state, result.observations, options.polish, sigma=result.sigma
+    ).reprojection_errors()

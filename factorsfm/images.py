@@ -1,0 +1,76 @@
+"""Images as the mapper sees them: tracks instead of pixels, and what became of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorsfm.reconstruction import FrameStatus
+from factorsfm.refinement import Observations
+from factorsfm.registration import ImageDepth
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class ImageTracks:
+    """What the mapper knows of an image: its tracks, and the depth prior at them where it has one.
+
+    Attributes:
+        position: index among the frames seen.
+        ids: (n,) identities of the tracks, ascending.
+        xy: (n, 2) undistorted normalised image coordinates.
+        depth: prior at the n keypoints.
+    """
+
+    position: int
+    ids: Index
+    xy: Array
+    depth: ImageDepth | None = None
+
+
+@dataclass(slots=True)
+class MappedImage:
+    """An image and what is known of its pose."""
+
+    tracks: ImageTracks
+    status: FrameStatus
+    message: str
+    rotation: Array | None = None
+    translation: Array | None = None
+    keyframe: bool = False
+    inliers: int = 0
+    affine: tuple[float, float] | None = None
+
+    @property
+    def registered(self) -> bool:
+        return self.rotation is not None
+
+    @property
+    def pose(self) -> tuple[Array, Array]:
+        """`cam_from_world` rotation and translation of a registered image."""
+        if self.rotation is None or self.translation is None:
+            raise ValueError(f"image {self.tracks.position} is not registered")
+        return self.rotation, self.translation
+
+
+def gather(images: Sequence[MappedImage], ids: Index) -> Observations:
+    """Observations of some tracks (ascending ids): frames and points are rows of `images` and `ids`."""
+    frame, point, xy = [], [], []
+    for row, image in enumerate(images):
+        seen = np.nonzero(np.isin(image.tracks.ids, ids, assume_unique=True))[0]
+        frame.append(np.full(len(seen), row))
+        point.append(np.searchsorted(ids, image.tracks.ids[seen]))
+        xy.append(image.tracks.xy[seen])
+    order = np.lexsort((np.concatenate(frame), np.concatenate(point)))
+    return Observations(np.concatenate(frame)[order], np.concatenate(point)[order], np.concatenate(xy)[order])
+
+
+def median_flow(a: ImageTracks, b: ImageTracks) -> float:
+    """Median displacement of the shared tracks, normalised image coordinates; infinite without any."""
+    _, in_a, in_b = np.intersect1d(a.ids, b.ids, assume_unique=True, return_indices=True)
+    return float(np.median(np.linalg.norm(a.xy[in_a] - b.xy[in_b], axis=1))) if len(in_a) else float("inf")

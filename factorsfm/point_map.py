@@ -1,0 +1,60 @@
+"""The sparse map: a position for every track that has one."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorsfm.factors import camera_points
+from factorsfm.images import MappedImage
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+
+class PointMap:
+    """World positions by track id."""
+
+    def __init__(self) -> None:
+        self._points = np.full((1024, 3), np.nan)
+
+    def contains(self, ids: Index) -> Mask:
+        """Which of the tracks have a position."""
+        inside = ids < len(self._points)
+        found = np.zeros(len(ids), bool)
+        found[inside] = np.isfinite(self._points[ids[inside], 0])
+        return found
+
+    def at(self, ids: Index) -> Array:
+        """(n, 3) positions of tracks that have one."""
+        return self._points[ids]
+
+    def set(self, ids: Index, points: Array) -> None:
+        """Add or move points."""
+        while len(ids) and ids.max() >= len(self._points):
+            self._points = np.concatenate([self._points, np.full_like(self._points, np.nan)])
+        self._points[ids] = points
+
+    def all(self) -> tuple[Index, Array]:
+        """Track ids (ascending) and positions of all points."""
+        ids = np.nonzero(np.isfinite(self._points[:, 0]))[0]
+        return ids, self._points[ids]
+
+    def inverse_depths(self, image: MappedImage, rows: Mask) -> Array:
+        """Inverse depths of mapped tracks in an image, 0 behind its camera."""
+        z = self._seen_from(image, image.tracks.ids[rows])[:, 2]
+        return np.where(z > 1e-6, 1.0 / np.maximum(z, 1e-6), 0.0)
+
+    def reprojection_errors(self, image: MappedImage, rows: Mask) -> Array:
+        """Errors of mapped tracks in an image (normalised coordinates), infinite behind its camera."""
+        q = self._seen_from(image, image.tracks.ids[rows])
+        front = q[:, 2] > 1e-6
+        error = np.full(len(q), np.inf)
+        projected = q[front, :2] / q[front, 2:]
+        error[front] = np.linalg.norm(projected - image.tracks.xy[rows][front], axis=1)
+        return error
+
+    def _seen_from(self, image: MappedImage, ids: Index) -> Array:
+        points = self.at(ids)
+        return camera_points(*image.pose, points, np.ones(len(points)))
