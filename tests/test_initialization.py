@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from estimation_problems import angles_between, make_problem
 
-from factorsfm.initialization import ImageTracks, NoStart, Start, lift, start_essential, start_lifted, start_pair
+from factorsfm.images import ImageTracks
+from factorsfm.initialization import NoStart, Start, lift, start_essential, start_lifted, start_pair
 from factorsfm.registration import ImageDepth
 
 PAIR = {"focal": 628.0, "sigma": 0.25, "inlier_px": 3.0}
