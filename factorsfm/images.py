@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +35,12 @@ class ImageTracks:
 
 @dataclass(slots=True)
 class MappedImage:
-    """An image and what is known of its pose."""
+    """An image and what is known of its pose.
+
+    Attributes:
+        affine: scale and shift of its depth prior beside the map.
+        outliers: of a keyframe, tracks whose point the updated map puts elsewhere.
+    """
 
     tracks: ImageTracks
     status: FrameStatus
@@ -45,6 +50,7 @@ class MappedImage:
     keyframe: bool = False
     inliers: int = 0
     affine: tuple[float, float] | None = None
+    outliers: Index = field(default_factory=lambda: np.zeros(0, np.int64))
 
     @property
     def registered(self) -> bool:

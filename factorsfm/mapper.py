@@ -256,6 +256,7 @@ class Mapper:
         for position, (rotation, translation) in self.graph.poses().items():
             self.images[position].rotation, self.images[position].translation = rotation, translation
         image.affine = self.graph.affine(tracks.position) or image.affine
+        image.outliers = tracks.ids[self.points.contains(tracks.ids) & ~self._explained(image)]
 
     def _explained(self, image: MappedImage) -> NDArray[np.bool_]:
         """Which tracks have a point that projects where it was seen, within the widened inlier threshold."""
