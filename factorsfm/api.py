@@ -52,8 +52,7 @@ def reconstruct(
     """
     begin = time.perf_counter()
     options = Options.preset_named(preset)
-    kind = DepthKind(depth_kind) if depth_kind is not None else None
-    prior = open_depth(depth, kind) if options.uses_depth else None
+    prior = open_depth(depth, depth_kind) if options.uses_depth else None
     mask_prior = open_masks(masks)
     iterator = read_frames(source, frames)
     if camera is None:

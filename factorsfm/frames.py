@@ -132,15 +132,23 @@ def _array_frames(
     chosen = itertools.islice(enumerate(images), selection.start, selection.stop, selection.step)
     for index, image in chosen:
         if isinstance(image, Frame):
-            yield replace(image, image=_bgr(image.image, index))
+            yield replace(image, image=bgr_image(image.image, index))
         else:
-            yield Frame(index, _bgr(image, index), f"{index:06d}")
+            yield Frame(index, bgr_image(image, index), f"{index:06d}")
 
 
-def _bgr(image: object, index: int) -> NDArray[np.uint8]:
+def bgr_image(image: object, index: int) -> NDArray[np.uint8]:
+    """(h, w, 3) uint8 from a grey, BGR or BGRA image of 8 or 16 bits.
+
+    Args:
+        index: of the frame, for the message.
+
+    Raises:
+        InputError: it is no such image.
+    """
     if not isinstance(image, np.ndarray) or image.dtype not in (np.uint8, np.uint16):
-        found = f"array of {image.dtype}" if isinstance(image, np.ndarray) else type(image).__name__
-        raise InputError(f"frame {index} is a {found}; an array of uint8 or uint16 is expected")
+        found = f"an array of {image.dtype}" if isinstance(image, np.ndarray) else f"of type {type(image).__name__}"
+        raise InputError(f"frame {index} is {found}; an array of uint8 or uint16 is expected")
     channels = image.shape[2] if image.ndim == 3 else 1
     if image.ndim not in (2, 3) or channels not in (1, 3, 4) or image.size == 0:
         raise InputError(f"frame {index} has shape {image.shape}; (h, w), (h, w, 3) or (h, w, 4) is expected")
@@ -218,7 +226,7 @@ def _video_frames(path: Path, selection: slice, has_timestamps: bool) -> Iterato
             decoded, image = video.retrieve()
             if not decoded:
                 raise InputError(f"frame {index} of {path} cannot be decoded")
-            yield Frame(index, _bgr(image, index), f"{index:06d}", timestamp)
+            yield Frame(index, bgr_image(image, index), f"{index:06d}", timestamp)
 
 
 @contextmanager

@@ -21,6 +21,7 @@ Image = NDArray[np.uint8]
 
 _PATCH_SUPPORT = 22  # half side of a stored birth patch: the window at half the birth's scale, with its margin
 _GRID = 24  # cells along the longer image side in which the local motion is estimated
+_BLANK_SHARE = 0.2  # of the texture of the last frame; with less, a frame among others is black or a flash
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,12 +29,12 @@ class TrackedFrame:
     """Tracks alive in one frame.
 
     Attributes:
-        ids: (n,) identities, never reused.
+        ids: (n,) identities, never reused; none in a frame that is blank beside the one before.
         xy: (n, 2) pixels, centres at integers.
         lost: tracks that ended here.
         born: tracks that start here.
         flow: median displacement against the frame before (pixels); NaN in the first frame.
-        texture: standard deviation of the grey values at the scale of a feature, a measure of blankness.
+        texture: standard deviation of the Laplacian at the scale of a feature (grey levels), a measure of blankness.
     """
 
     ids: NDArray[np.int64]
@@ -50,6 +51,7 @@ class FlowTracker:
     def __init__(self, options: TrackerOptions) -> None:
         self.options = options
         self._previous: Image | None = None
+        self._texture = 0.0  # of the previous image
         self._frame = 0
         self._next_id = 0
         self._ids = np.zeros(0, np.int64)
@@ -67,6 +69,9 @@ class FlowTracker:
             mask: (h, w), True where nothing may be tracked.
         """
         grey = np.ascontiguousarray(image) if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        texture = _texture(grey)
+        if texture < _BLANK_SHARE * self._texture:  # the tracks wait for the next frame that shows something
+            return TrackedFrame(np.zeros(0, np.int64), np.zeros((0, 2)), 0, 0, float("nan"), texture)
         before = len(self._ids)
         flow = float("nan")
         if self._previous is not None and before:
@@ -76,9 +81,8 @@ class FlowTracker:
                 flow = float(np.median(np.linalg.norm(self._xy - start[kept], axis=1)))
         lost = before - len(self._ids)
         born = self._replenish(grey, mask)
-        self._previous = grey
+        self._previous, self._texture = grey, texture
         self._frame += 1
-        texture = float(cv2.Laplacian(cv2.GaussianBlur(grey, (0, 0), 1.5), cv2.CV_32F).std())
         return TrackedFrame(self._ids.copy(), self._xy.astype(np.float64), lost, born, flow, texture)
 
     def drop(self, ids: NDArray[np.int64]) -> None:
@@ -123,7 +127,7 @@ class FlowTracker:
         atlas, centers = _warped_atlas(self._patches, self._affine, half, grey.shape)
         height = max(atlas.shape[0], grey.shape[0])
         atlas = cv2.copyMakeBorder(atlas, 0, height - atlas.shape[0], 0, 0, cv2.BORDER_REPLICATE)
-        padded = cv2.copyMakeBorder(grey, 0, height - grey.shape[0], 0, 0, cv2.BORDER_REPLICATE)
+        padded = cv2.copyMakeBorder(grey, 0, height - grey.shape[0], 0, 0, cv2.BORDER_REFLECT_101)
         aligned, status, _ = cv2.calcOpticalFlowPyrLK(
             atlas,
             padded,
@@ -181,6 +185,11 @@ class FlowTracker:
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.003)
 
 
+def _texture(grey: Image) -> float:
+    # In floats: the rounding of 8 bits alone would look like texture.
+    return float(cv2.Laplacian(cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 1.5), cv2.CV_32F).std())
+
+
 def _flow_checked(
     a: Image, b: Image, xy: Array, window: int, levels: int, limit: float
 ) -> tuple[Array, NDArray[np.bool_]]:
@@ -224,7 +233,7 @@ def _spread(corners: Array, count: int, shape: tuple[int, ...]) -> Array:
 
 
 def _cut_patches(grey: NDArray[np.uint8], xy: Array, support: int) -> NDArray[np.uint8]:
-    """(n, side, side) patches resampled so that each point lies exactly in the centre."""
+    """(n, side, side) patches resampled so that each point lies exactly in the centre; borders as in OpenCV's flow."""
     offset = np.arange(-support, support + 1, dtype=np.float32)
     side = len(offset)
     map_x = np.broadcast_to(xy[:, 0, None, None] + offset, (len(xy), side, side)).reshape(-1, side)
@@ -236,7 +245,7 @@ def _remap(image: NDArray[np.uint8], map_x: Array, map_y: Array) -> NDArray[np.u
     """`cv2.remap` with maps of any number of rows (one call takes fewer than 32,768)."""
     rows = [
         cv2.remap(image, np.ascontiguousarray(map_x[i : i + 30000]), np.ascontiguousarray(map_y[i : i + 30000]),
-                  cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+                  cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT_101)
         for i in range(0, len(map_x), 30000)
     ]  # fmt: skip
     return np.concatenate(rows)
