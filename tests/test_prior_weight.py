@@ -8,7 +8,7 @@ from factorsfm.prior_weight import PriorWeight, direction_angles, field_grid, me
 EXTENT = np.array([0.9, 0.5])  # of the directions, radians
 
 
-def scene(count=200, seed=0):
+def scene(count=100, seed=0):
     """Directions of points and their inverse depths, median about 1."""
     rng = np.random.default_rng(seed)
     angles = rng.uniform(-EXTENT / 2, EXTENT / 2, (count, 2))
@@ -51,7 +51,7 @@ def test_sample_points_are_ascending_and_repeatable():
 # --- measuring --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("smooth", "local"), [(0.1, 0.1), (0.4, 0.07), (0.1, 0.3), (0.8, 0.2)])
+@pytest.mark.parametrize(("smooth", "local"), [(0.1, 0.1), (0.4, 0.07), (0.2, 0.3), (0.8, 0.2)])
 def test_the_model_is_recovered_from_its_own_data(smooth, local):
     found = measured(smooth, local)
     assert 0.5 < found.smooth / smooth < 2.0
