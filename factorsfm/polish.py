@@ -28,7 +28,9 @@ _SMALLEST_SIGMA_PX = 0.03
 _RAYLEIGH_MEDIAN = 1.1774  # median of the norm of a 2-D error, in standard deviations
 _CORE_TRACKS = 400  # tracks with which the cameras converge first
 _TRIANGULATION_VIEWS = 10
-_FOCAL_STD = 0.05  # relative standard deviation up to which a focal length counts as determined
+# Relative standard deviation up to which a focal length counts as determined. It knows nothing of systematic tracking
+# errors: on a dolly without rotation, 0.9 % stood beside an error of 12 %.
+FOCAL_STD = 0.005
 
 
 @dataclass(slots=True)
@@ -80,6 +82,9 @@ def polish(
     focal_std = None
     if options.refine_focal_length:
         adjustment, focal_std = _checked_focal(adjustment, few, o, focal)
+        # The pixels were normalised with the guess.
+        ratio = focal / float(np.exp(adjustment.state.log_focal))
+        few, observations = (replace(part, xy=part.xy * ratio) for part in (few, observations))
     motion = classify_motion(adjustment, few, o)
     inflation = _temporal_inflation(adjustment, few)
     weighed = None
@@ -120,7 +125,7 @@ def polish(
     )  # fmt: skip
     if len(frames) < len(registered):
         progress("polish: frames between")
-        _add_frames_between(result, images, registered, options)
+        _add_frames_between(result, images, registered, focal, options)
     return result
 
 
@@ -253,7 +258,7 @@ def _checked_focal(
     covariance, _ = adjustment.covariance(np.zeros(0, np.int64))
     column = 6 * len(adjustment.state.rotation)
     std = float(np.sqrt(covariance[column, column] * _temporal_inflation(adjustment, observations)))
-    if std > _FOCAL_STD or not 0.3 < float(np.exp(adjustment.state.log_focal)) / guess < 3.0:
+    if std > FOCAL_STD or not 0.3 < float(np.exp(adjustment.state.log_focal)) / guess < 3.0:
         scaled = replace(adjustment.state, log_focal=float(np.log(guess)))
         adjustment = BundleAdjustment(scaled, observations, options, sigma=adjustment.sigma)
         adjustment.solve()
@@ -290,8 +295,10 @@ def _solved_frames(images: list[MappedImage], registered: list[int], limit: int)
     return sorted(keyframes + fill)
 
 
-def _add_frames_between(result: Polished, images: list[MappedImage], registered: list[int], options: Options) -> None:
-    """Register the frames that were left out on the polished points."""
+def _add_frames_between(
+    result: Polished, images: list[MappedImage], registered: list[int], guess: float, options: Options
+) -> None:
+    """Register the frames that were left out on the polished points; `guess` is the focal length of their tracks."""
     state, m = result.state, options.mapper
     focal = float(np.exp(state.log_focal))
     solved = np.array(result.frames)
@@ -306,7 +313,7 @@ def _add_frames_between(result: Polished, images: list[MappedImage], registered:
             continue
         near = int(solved[np.argmin(np.abs(solved - f))])
         found = register_image(
-            points[theirs], tracks.xy[mine], *poses[near],
+            points[theirs], tracks.xy[mine] * (guess / focal), *poses[near],
             focal=focal, sigma=max(result.sigma, _SMALLEST_SIGMA_PX), inlier_px=m.inlier_px,
         )  # fmt: skip
         if found.inliers.sum() >= m.min_inliers:
@@ -326,7 +333,8 @@ def _add_frames_between(result: Polished, images: list[MappedImage], registered:
         p.images = new_row[p.images]
         p.observations = replace(p.observations, frame=new_row[p.observations.frame])
     result.frames = frames
-    result.observations = gather([images[f] for f in frames], result.tracks)
+    observations = gather([images[f] for f in frames], result.tracks)
+    result.observations = replace(observations, xy=observations.xy * (guess / focal))
     result.errors = BundleAdjustment(
         result.state, result.observations, options.polish, sigma=result.sigma
     ).reprojection_errors()

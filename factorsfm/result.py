@@ -9,8 +9,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.mapper import MappedImage
-from factorsfm.polish import Polished
+from factorsfm.images import MappedImage
+from factorsfm.polish import FOCAL_STD, Polished
 from factorsfm.reconstruction import FrameResult, FrameStatus, PriorFit, Reconstruction, ShotKind
 from factorsfm.refinement import State
 
@@ -36,6 +36,7 @@ def assemble(
     colors: NDArray[np.uint8],
     camera: pycolmap.Camera,
     *,
+    prior_given: bool,
     metric: bool,
     focal_guessed: bool,
     seconds: dict[str, float],
@@ -46,9 +47,12 @@ def assemble(
     Args:
         pixels: keypoints (pixels, centres at integers) of each frame, in the order of its track ids.
         colors: RGB by track id.
-        metric: whether the prior's unit is the metre.
+        prior_given: whether there is a depth prior at all; metric: whether its unit is the metre.
     """
-    state, notes = polished.state, _notes(polished, focal_guessed)
+    has_depth = any(image.tracks.depth is not None for image in images)
+    state, notes = polished.state, _notes(polished, has_depth, focal_guessed)
+    if prior_given and not has_depth:
+        notes.append("The depth prior took no part: no frame that needed it has a usable depth map.")
     scale = _metric_scale(polished, images) if metric else None
     unit = scale or 1.0
     if focal_guessed:
@@ -140,7 +144,7 @@ def _frame_results(
     error = np.array([float(np.median(polished.errors[o.frame == k])) if n else np.nan for k, n in enumerate(seen)])
     results = []
     row_of = {position: row for row, position in enumerate(polished.frames)}
-    prior = _prior_fits(polished, images)
+    prior = _prior_fits(polished, images, unit)
     for position, (frame, image) in enumerate(zip(frames, images, strict=True)):
         result = FrameResult(
             frame.index, frame.name, frame.timestamp, image.status, image.message,
@@ -166,7 +170,7 @@ def _frame_results(
     return results
 
 
-def _prior_fits(polished: Polished, images: list[MappedImage]) -> dict[int, PriorFit]:
+def _prior_fits(polished: Polished, images: list[MappedImage], unit: float) -> dict[int, PriorFit]:
     if (p := polished.prior) is None:
         return {}
     fits = {}
@@ -175,30 +179,30 @@ def _prior_fits(polished: Polished, images: list[MappedImage]) -> dict[int, Prio
         assert depth is not None
         residual = p.residual[p.observations.image == i]
         fits[row] = PriorFit(
-            scale=float(polished.state.scale[i]) * depth.unit,
+            scale=float(polished.state.scale[i]) * depth.unit * unit,
             shift=float(polished.state.shift[i]) * depth.unit,
-            scale_std=float(p.scale_std[i]) * depth.unit,
+            scale_std=float(p.scale_std[i]) * depth.unit * unit,
             shift_std=float(p.shift_std[i]) * depth.unit,
             sigma=1.4826 * float(np.median(np.abs(residual))) * depth.unit,
         )
     return fits
 
 
-def _notes(polished: Polished, focal_guessed: bool) -> list[str]:
+def _notes(polished: Polished, has_depth: bool, focal_guessed: bool) -> list[str]:
     notes, motion = list(polished.notes), polished.motion
+    depths = "depths and their scale come from the prior alone" if has_depth else "depths are unknown without a prior"
     if motion.kind is ShotKind.STATIC:
         notes.append(
-            f"The camera is static: no frame moves by more than {motion.displacement_px:.2f} pixels; "
-            "depths come from the prior alone."
+            f"The camera is static: no frame moves by more than {motion.displacement_px:.2f} pixels; {depths}."
         )
     elif motion.kind is ShotKind.ROTATION:
         notes.append(
             "The camera only rotates: its translation is not observable from geometry and is reported as zero; "
-            "depths and their scale come from the prior alone."
+            f"{depths}."
         )
     if focal_guessed:
         focal, std = float(np.exp(polished.state.log_focal)), polished.focal_std
-        if std is not None and std <= 0.05:
+        if std is not None and std <= FOCAL_STD:
             notes.append(f"The focal length was estimated: {focal:.0f} pixels, standard deviation {100 * std:.1f} %.")
         else:
             notes.append(f"The focal length is a guess ({focal:.0f} pixels): this shot does not determine it.")

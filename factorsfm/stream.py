@@ -11,12 +11,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from factorsfm.camera import check_camera, guess_camera, normalized_from_pixels
-from factorsfm.errors import InputError, ReconstructionError
-from factorsfm.frames import Frame
-from factorsfm.initialization import ImageTracks
-from factorsfm.mapper import MappedImage, Mapper
+from factorsfm.errors import FactorsfmError, InputError, ModelError, ReconstructionError
+from factorsfm.frames import Frame, bgr_image
+from factorsfm.images import ImageTracks, MappedImage
+from factorsfm.mapper import Mapper
 from factorsfm.options import Options
 from factorsfm.polish import polish
 from factorsfm.priors.depth import DepthKind, DepthPrior
@@ -26,7 +27,7 @@ from factorsfm.registration import ImageDepth
 from factorsfm.result import assemble
 from factorsfm.tracks.flow import FlowTracker
 
-_BLANK_TEXTURE = 1.0  # grey levels; below this an image is black, white or out of focus
+_BLANK_TEXTURE = 0.2  # grey levels; below this an image is black, white or out of focus
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +57,7 @@ class SeenFrame:
     index: int
     name: str
     timestamp: float | None
+    texture: float
 
 
 class Stream:
@@ -99,13 +101,15 @@ class Stream:
         """Take the next frame.
 
         Args:
-            frame: a `Frame`, or an image (h, w, 3) BGR or (h, w) grey, 8 bits.
+            frame: a `Frame`, or an image (h, w, 3) BGR or (h, w) grey.
 
         Raises:
-            InputError: its size differs from that of the frames before, or contradicts the camera.
+            InputError: it is no image, its size differs from that of the frames before or contradicts the camera, or
+                a prior fails on it; after the former the stream can go on with another frame.
         """
         if not isinstance(frame, Frame):
             frame = Frame(len(self.frames), frame, f"{len(self.frames):06d}", None)
+        frame = replace(frame, image=bgr_image(frame.image, frame.index))
         mapper = self._mapper or self._open(frame)
         if frame.image.shape[1::-1] != self._size:
             raise InputError(
@@ -113,7 +117,7 @@ class Stream:
                 f"expected {self._size[0]}x{self._size[1]} as the frames before"
             )
         with self._timed("masks"):
-            mask = self._masks(frame) if self._masks is not None else None
+            mask = self._read_mask(frame)
         with self._timed("tracking"):
             tracked = self._tracker.track(frame.image, mask)
         self._remember_colors(frame.image, tracked.ids, tracked.xy)
@@ -121,13 +125,13 @@ class Stream:
         undistorted = np.isfinite(xy).all(axis=1)  # a distortion model may have no inverse in the corners
         pixels = tracked.xy[undistorted]
         tracks = ImageTracks(len(self.frames), tracked.ids[undistorted], xy[undistorted])
-        self.frames.append(SeenFrame(frame.index, frame.name, frame.timestamp))
+        self.frames.append(SeenFrame(frame.index, frame.name, frame.timestamp, tracked.texture))
         self._pixels.append(pixels)
         with self._timed("mapping"):
             image = mapper.add(tracks, lambda: self._read_depth(frame, pixels))
-        if tracked.texture < _BLANK_TEXTURE and not image.registered:
-            image.status = FrameStatus.BLANK
-            image.message = f"contrast {tracked.texture:.1f} of {_BLANK_TEXTURE:.1f} needed grey levels"
+        self._tracker.drop(image.outliers)
+        if image.status is not FrameStatus.WAITING:  # it may still take part in the start
+            _mark_blank(image, tracked.texture)
         return _update(frame.index, image)
 
     def finish(self, progress: Callable[[str, int, int | None], None] | None = None) -> Reconstruction:
@@ -138,9 +142,11 @@ class Stream:
         """
         mapper = self._mapper
         if mapper is None or len(self.frames) < 2:
-            raise self._failure(f"{len(self.frames)} frames, at least 2 needed")
+            raise self._failure(f"frames in the shot: {len(self.frames)}, at least 2 needed")
         with self._timed("mapping"):
             mapper.finish()
+        for image, seen in zip(mapper.images, self.frames, strict=True):
+            _mark_blank(image, seen.texture)
         registered = sum(image.registered for image in mapper.images)
         if registered < 2:
             worst = next((i for i in mapper.images if not i.registered), mapper.images[0])
@@ -148,10 +154,11 @@ class Stream:
                 f"{registered} of {len(mapper.images)} frames registered, at least 2 needed; "
                 f"frame {self.frames[worst.tracks.position].index}: {worst.message}"
             )
-        with self._timed("polish"):
+        # The matrices are small: BLAS threads would mostly wait for each other, on busy cores for a hundred times as long.
+        with self._timed("polish"), threadpool_limits(1, "blas"):
             result = polish(
                 mapper.images,
-                mapper.map_points(),
+                mapper.points.all(),
                 mapper.focal,
                 self.options,
                 lambda stage: progress(stage, 0, None) if progress else None,
@@ -163,6 +170,7 @@ class Stream:
             self._pixels,
             self._colors,
             self.camera,
+            prior_given=self._depth is not None,
             metric=self._depth is not None and self._depth.kind is DepthKind.METRIC,
             focal_guessed=self._focal_guessed,
             seconds=dict(self.seconds),
@@ -193,10 +201,22 @@ class Stream:
         ]  # fmt: skip
         return ReconstructionError(message, frames)
 
+    def _read_mask(self, frame: Frame) -> NDArray[np.bool_] | None:
+        if self._masks is None:
+            return None
+        with _failure_named("mask", frame):
+            mask = self._masks(frame)
+        if mask is not None and mask.shape != frame.image.shape[:2]:
+            raise InputError(
+                f"the mask of frame {frame.index} has shape {mask.shape}, expected {frame.image.shape[:2]} as the frame"
+            )
+        return mask
+
     def _read_depth(self, frame: Frame, xy: NDArray[np.float64]) -> ImageDepth | None:
         assert self._depth is not None
         with self._timed("depth"):
-            depth_map = self._depth(frame)
+            with _failure_named("depth", frame):
+                depth_map = self._depth(frame)
             if depth_map is None:
                 return None
             inverse, reliability = depth_map.inverse_depth(xy, self._size)
@@ -225,6 +245,24 @@ class Stream:
             yield
         finally:
             self.seconds[stage] += time.perf_counter() - start
+
+
+@contextmanager
+def _failure_named(what: str, frame: Frame) -> Iterator[None]:
+    """A prior is foreign code: whatever it raises becomes an error that names the frame."""
+    try:
+        yield
+    except FactorsfmError:
+        raise
+    except Exception as error:
+        raise ModelError(f"the {what} prior failed on frame {frame.index}: {error!r}") from error
+
+
+def _mark_blank(image: MappedImage, texture: float) -> None:
+    """Where an image without texture is not registered, that is the reason to give."""
+    if texture < _BLANK_TEXTURE and not image.registered:
+        image.status = FrameStatus.BLANK
+        image.message = f"contrast {texture:.2f} of {_BLANK_TEXTURE:.2f} needed grey levels"
 
 
 def _update(index: int, image: MappedImage) -> FrameUpdate:

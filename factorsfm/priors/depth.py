@@ -257,12 +257,13 @@ def open_depth(spec: str | Path | DepthPrior | None, kind: DepthKind | str | Non
     Raises:
         InputError: `spec` is none of these, or `kind` contradicts the prior given.
     """
+    kind = None if kind is None else _depth_kind(kind)
     if spec is None or spec == "none":
         return None
     if not isinstance(spec, str | Path):
         if not isinstance(spec, DepthPrior):
             raise InputError(f"a depth prior must have a kind and a name and be callable, not {spec!r}")
-        if kind is not None and _depth_kind(kind) is not spec.kind:
+        if kind is not None and kind is not spec.kind:
             raise InputError(f"the depth prior {spec.name} is of kind {spec.kind}, not {kind}")
         return spec
     if str(spec) in MODELS or Path(spec).suffix.lower() == ".onnx":
