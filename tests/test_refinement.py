@@ -23,7 +23,7 @@ EXACT = PolishOptions(iterations=60, tolerance=1e-12, point_sigma=1e3)
 FIELD = (4, 3)  # columns and rows of the nodes of the smooth field in these tests
 
 
-def with_prior(problem, images, *, noise=0.05, smooth=0.0, scale_std=0.1, shift_std=0.1, seed=0):
+def with_prior(problem, images, *, noise=0.05, smooth=0.0, scale_std=0.15, shift_std=0.08, seed=0):
     """A prior on some frames, drawn from its own model: the values, and the truth that carries its variables."""
     rng = np.random.default_rng([seed, 3])
     truth, n, k = problem.truth, len(problem.points), len(images)
