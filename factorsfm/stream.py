@@ -154,7 +154,7 @@ class Stream:
                 f"{registered} of {len(mapper.images)} frames registered, at least 2 needed; "
                 f"frame {self.frames[worst.tracks.position].index}: {worst.message}"
             )
-        # The matrices are small: BLAS threads would mostly wait for each other, on busy cores for a hundred times as long.
+        # The matrices are small: on busy cores BLAS threads would spend nearly all the time waiting for each other.
         with self._timed("polish"), threadpool_limits(1, "blas"):
             result = polish(
                 mapper.images,

@@ -10,7 +10,7 @@ from factorsfm.evaluation.alignment import pose_arrays
 from factorsfm.evaluation.metrics import TrajectoryErrors, trajectory_errors
 from factorsfm.synthetic import Motion, RenderedShot, render_shot, simulate_prior
 
-FRAMES = 10
+FRAMES = 8
 
 
 @cache

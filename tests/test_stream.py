@@ -1,0 +1,227 @@
+"""The stream: what it takes, what it refuses, and that it equals the one call."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from rendered import FRAMES, Maps, errors_of, quick_presets, rendered, simulated_maps, with_fewer_tracks
+
+import factorsfm
+from factorsfm import (
+    Frame,
+    FrameStatus,
+    FrameUpdate,
+    InputError,
+    ModelError,
+    Options,
+    Reconstruction,
+    ReconstructionError,
+    ShotKind,
+    Stream,
+)
+
+QUICK = with_fewer_tracks(Options())
+
+
+def stream(motion="dolly", **arguments) -> Stream:
+    arguments.setdefault("depth", Maps(simulated_maps(motion)))
+    arguments.setdefault("options", QUICK)
+    return Stream(arguments.pop("camera", rendered(motion).camera), **arguments)
+
+
+def poses(result: Reconstruction) -> np.ndarray:
+    return np.array([frame.cam_from_world.matrix() for frame in result.frames])
+
+
+@pytest.fixture(scope="module")
+def run() -> tuple[list[FrameUpdate], Reconstruction]:
+    s = stream()
+    updates = [s.push(image) for image in rendered("dolly").images]
+    return updates, s.finish()
+
+
+def test_every_frame_has_a_causal_pose(run):
+    updates, _ = run
+    shot = rendered("dolly")
+    assert [u.index for u in updates] == list(range(FRAMES))
+    assert {u.status for u in updates} == {FrameStatus.REGISTERED}
+    assert updates[0].keyframe
+    assert all(30 <= u.inliers <= u.tracks <= 250 for u in updates)
+    turns = [
+        np.degrees((u.cam_from_world.rotation * true.rotation.inverse()).angle())
+        for u, true in zip(updates, shot.cam_from_world, strict=True)
+    ]
+    assert max(turns) < 0.5
+    z = [u.cam_from_world.inverse().translation[2] for u in updates]
+    assert np.all(np.diff(z) > 0)  # the dolly goes forward
+
+
+def test_the_polished_path_is_the_true_one(run):
+    _, result = run
+    error = errors_of(result, rendered("dolly"))
+    assert 1e-5 < np.median(error.ate) < 0.01  # share of the path's length
+    assert 1e-5 < np.median(error.r_rpe) < 0.03  # degrees
+    assert result.kind is ShotKind.GENERAL
+    assert result.notes == []
+    assert 0.03 < result.parallax < 0.07  # 0.05 of the median depth of all pixels
+    assert [frame.name for frame in result.frames[:2]] == ["000000", "000001"]
+    assert set(result.seconds) >= {"tracking", "depth", "mapping", "polish"}
+
+
+def test_results_are_deterministic_and_equal_those_of_the_one_call(run, monkeypatch):
+    monkeypatch.setattr("factorsfm.options.PRESETS", quick_presets())
+    _, result = run
+    shot = rendered("dolly")
+    again = factorsfm.reconstruct(shot.images, camera=shot.camera, depth=Maps(simulated_maps("dolly")))
+    np.testing.assert_array_equal(poses(again), poses(result))
+    np.testing.assert_array_equal(again.points, result.points)
+    np.testing.assert_array_equal(again.colors, result.colors)
+
+
+def test_two_streams_do_not_disturb_each_other(run):
+    updates, _ = run
+    one, other = stream(), stream("truck")
+    for k, (image, foreign) in enumerate(zip(rendered("dolly").images, rendered("truck").images, strict=True)):
+        update = one.push(image)
+        other.push(foreign)
+        assert (update.tracks, update.inliers) == (updates[k].tracks, updates[k].inliers)
+        np.testing.assert_array_equal(update.cam_from_world.matrix(), updates[k].cam_from_world.matrix())
+
+
+def test_colours_are_those_of_the_picture(run):
+    _, result = run
+    first = result.observation_frame == 0
+    x, y = np.rint(result.observation_xy[first]).astype(int).T
+    expected = rendered("dolly").images[0][y, x, ::-1]
+    np.testing.assert_array_equal(result.colors[result.observation_point[first]], expected)
+
+
+@pytest.mark.parametrize("form", ["grey", "grey_channel", "bgra", "uint16", "frame"])
+def test_every_form_of_image_gives_the_same_tracks(form):
+    def formed(k, image):
+        grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        return {
+            "grey": grey,
+            "grey_channel": grey[..., None],
+            "bgra": cv2.cvtColor(image, cv2.COLOR_BGR2BGRA),
+            "uint16": image.astype(np.uint16) * 256,
+            "frame": Frame(k, grey, f"{k:06d}"),
+        }[form]
+
+    plain, other = stream(), stream()
+    for k, image in enumerate(rendered("dolly").images[:4]):
+        a, b = plain.push(image), other.push(formed(k, image))
+        assert (a.status, a.tracks, a.inliers) == (b.status, b.tracks, b.inliers)
+        np.testing.assert_array_equal(a.cam_from_world.matrix(), b.cam_from_world.matrix())
+
+
+@pytest.mark.parametrize(
+    ("bad", "reason"),
+    [
+        (lambda i: i.astype(np.float32) / 255, "frame 2 is an array of float32"),
+        (lambda i: i.astype(np.int64), "frame 2 is an array of int64"),
+        (lambda i: "frame.png", "frame 2 is of type str"),
+        (lambda i: i[..., :2], r"frame 2 has shape \(180, 320, 2\)"),
+        (lambda i: i[:0], "frame 2 has shape"),
+        (lambda i: i[:90], "frame 2 is 320x90, expected 320x180"),
+        (lambda i: i.transpose(1, 0, 2), "frame 2 is 180x320"),
+    ],
+)
+def test_a_refused_frame_leaves_the_stream_as_it_was(bad, reason):
+    images = rendered("dolly").images
+    s, untouched = stream(), stream()
+    for image in images[:2]:
+        s.push(image)
+        untouched.push(image)
+    with pytest.raises(InputError, match=reason):
+        s.push(bad(images[2]))
+    expected, update = untouched.push(images[2]), s.push(images[2])
+    assert (update.index, update.tracks) == (2, expected.tracks)
+    np.testing.assert_array_equal(update.cam_from_world.matrix(), expected.cam_from_world.matrix())
+
+
+def test_a_camera_of_another_size_is_refused():
+    camera = factorsfm.guess_camera(640, 360)
+    with pytest.raises(InputError, match="camera is made for 640x360 pixels, but the images have 320x180"):
+        stream(camera=camera).push(rendered("dolly").images[0])
+
+
+@pytest.mark.parametrize("pushed", [0, 1])
+def test_finish_without_enough_frames(pushed):
+    s = stream()
+    for image in rendered("dolly").images[:pushed]:
+        s.push(image)
+    with pytest.raises(ReconstructionError, match=f"frames in the shot: {pushed}, at least 2 needed") as caught:
+        s.finish()
+    assert len(caught.value.frames) == pushed
+
+
+def test_an_unknown_lens_is_guessed_and_estimated():
+    s = stream(camera=None)
+    for image in rendered("dolly").images:
+        s.push(image)
+    result = s.finish()
+    assert s.camera.model_name == "SIMPLE_PINHOLE"
+    assert (result.camera.width, result.camera.height) == (320, 180)
+    assert len(result.registered) == FRAMES
+    assert any("focal length" in note for note in result.notes)
+    ratio = result.camera.mean_focal_length() / rendered("dolly").camera.mean_focal_length()
+    assert 0.7 < ratio < 1.4  # the guess says 50 degrees, the truth is 54
+
+
+class Failing(Maps):
+    def __call__(self, frame):
+        if frame.index in (0, 3):
+            raise RuntimeError("out of memory")
+        return super().__call__(frame)
+
+
+def test_a_depth_network_that_raises_is_named_with_the_frame():
+    with pytest.raises(ModelError, match=r"depth prior failed on frame 0: RuntimeError\('out of memory'\)"):
+        stream(depth=Failing(simulated_maps("dolly"))).push(rendered("dolly").images[0])
+
+
+@pytest.mark.parametrize(
+    ("masks", "error", "reason"),
+    [
+        (lambda frame: 1 / 0, ModelError, "mask prior failed on frame 0: ZeroDivisionError"),
+        (lambda frame: np.zeros((90, 160), bool), InputError, r"mask of frame 0 has shape \(90, 160\)"),
+    ],
+)
+def test_masks_that_cannot_be_used(masks, error, reason):
+    with pytest.raises(error, match=reason):
+        stream(masks=masks).push(rendered("dolly").images[0])
+
+
+def test_masked_regions_hold_no_point():
+    shot = rendered("dolly")
+
+    def left_half(frame: Frame) -> np.ndarray:
+        return np.repeat((np.arange(320) < 160)[None], 180, axis=0)
+
+    s = stream(masks=left_half, options=with_fewer_tracks(Options(), 200))
+    for image in shot.images:
+        s.push(image)
+    result = s.finish()
+    assert len(result.registered) == FRAMES
+    assert result.observation_xy[:, 0].min() > 159
+    assert np.median(errors_of(result, shot).ate) < 0.02
+
+
+def test_no_pixels_are_kept(run):
+    """A long stream holds keypoints and points, never images."""
+    s = stream(depth=None)
+    for image in rendered("dolly").images:
+        s.push(image)
+    assert all(not isinstance(value, np.ndarray) for seen in s.frames for value in seen.__getstate__())
+    per_frame = [pixels.nbytes for pixels in s._pixels]
+    assert max(per_frame) <= 250 * 16
+
+
+def test_options_are_written_with_the_result(run):
+    _, result = run
+    assert result.options["tracker"]["max_tracks"] == 250
+    assert result.options["preset"] == "default"
+    other = stream(options=replace(QUICK, preset="mine"))
+    assert other.options.to_dict()["preset"] == "mine"
