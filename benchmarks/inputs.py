@@ -1,0 +1,165 @@
+"""The inputs of a cell: the shot, its frames as the variant has them, and the depth prior."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from itertools import islice
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.plan import CRF_30, DEGRADED, FEW, FIRST_10, FIRST_20, FULL, NO_PRIOR
+from factorsfm import DepthFolder, DepthKind, DepthMap, DepthModel, DepthPrior, Frame, InputError
+from factorsfm.evaluation.degrade import degraded_frames
+from factorsfm.evaluation.readers import read_shot
+from factorsfm.evaluation.truth import DepthLookup, Shot
+from factorsfm.evaluation.useless_priors import ImageRowPrior, RandomSmoothPrior
+
+_CENTIMETRES = ("tsukuba-",)  # sets whose true translations are not in metres
+NETWORK_FILES = {
+    "tcmonodepth": "tcmonodepth_tcsmallnet_192x320.onnx",
+    "fastdepth": "fast_depth_224_fp32.onnx",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """A change of the input.
+
+    Attributes:
+        frames: how many of the first frames are used, None = all.
+        max_tracks: of our tracker, None = its default.
+    """
+
+    frames: int | None = None
+    max_tracks: int | None = None
+
+
+VARIANTS = {
+    FULL: Variant(),
+    FIRST_10: Variant(frames=10),
+    FIRST_20: Variant(frames=20),
+    FEW: Variant(max_tracks=40),
+    DEGRADED: Variant(frames=30),
+    CRF_30: Variant(frames=30),
+}
+
+
+def shot_folder(data: Path, name: str) -> Path:
+    """Folder of a set by its name, one level below the data folder.
+
+    Raises:
+        InputError: there is none.
+    """
+    found = sorted(data.glob(f"*/{name}"))
+    if not found:
+        raise InputError(f"there is no set {name} in {data}")
+    return found[0]
+
+
+def open_shot(data: Path, name: str, variant: str) -> Shot:
+    """The shot with its truth, cut to the frames of the variant."""
+    shot = read_shot(shot_folder(data, name), unit=0.01 if name.startswith(_CENTIMETRES) else 1.0)
+    frames = VARIANTS[variant].frames
+    if frames is None:
+        return shot
+    keep = shot.indices < frames
+    return replace(shot, indices=shot.indices[keep], rotations=shot.rotations[keep], centers=shot.centers[keep])
+
+
+def open_frames(shot: Shot, variant: str) -> Iterator[Frame]:
+    """The frames as the variant has them."""
+    frames = islice(shot.frames(), VARIANTS[variant].frames)
+    if variant == DEGRADED:
+        return degraded_frames(frames)
+    if variant == CRF_30:
+        return compressed_frames(frames, crf=30)
+    return frames
+
+
+def compressed_frames(frames: Iterable[Frame], crf: int) -> Iterator[Frame]:
+    """The frames after H.264 compression at a constant rate factor; needs the package imageio-ffmpeg."""
+    import imageio_ffmpeg
+
+    originals = list(frames)
+    height, width = originals[0].image.shape[:2]
+    with tempfile.TemporaryDirectory(prefix="crf-") as folder:
+        video = Path(folder) / "shot.mp4"
+        writer = imageio_ffmpeg.write_frames(
+            str(video),
+            (width, height),
+            pix_fmt_in="bgr24",
+            fps=24,
+            codec="libx264",
+            macro_block_size=2,
+            output_params=["-crf", str(crf)],
+        )
+        writer.send(None)
+        for frame in originals:
+            writer.send(np.ascontiguousarray(frame.image))
+        writer.close()
+        capture = cv2.VideoCapture(str(video))
+        for frame in originals:
+            done, image = capture.read()
+            if not done:
+                raise InputError(f"frame {frame.index} is missing in the compressed video")
+            yield replace(frame, image=np.asarray(image, np.uint8))
+        capture.release()
+
+
+class TrueDepthPrior:
+    """True or sensor depth, with multiplicative noise ``D (1 + alpha n)``, n standard normal per pixel."""
+
+    def __init__(self, depth: DepthLookup, kind: DepthKind, alpha: float = 0.0) -> None:
+        self.kind, self.name = kind, f"true depth, noise {alpha}"
+        self._depth, self._alpha = depth, alpha
+
+    def __call__(self, frame: Frame) -> DepthMap | None:
+        depth: NDArray[np.float32] | None = self._depth(frame.index)
+        if depth is None:
+            return None
+        noise = np.random.default_rng(frame.index).standard_normal(depth.shape, np.float32)
+        return DepthMap(depth * (1.0 + np.float32(self._alpha) * noise), self.kind)
+
+
+def open_prior(name: str, shot: Shot, data: Path, models: Path, cache: Path) -> DepthPrior | None:
+    """A prior by its name: a network, `simulated`, `sensor`, `image-row`, `random-field`, `noise-ALPHA`, `none`.
+
+    Raises:
+        InputError: no such prior.
+    """
+    if name == NO_PRIOR:
+        return None
+    if name in NETWORK_FILES:
+        return DepthModel(models / NETWORK_FILES[name])
+    if name == "simulated":
+        return DepthFolder(simulated_prior(shot.name, data, cache), DepthKind.INVERSE)
+    if name == "sensor":
+        return TrueDepthPrior(shot.depth, DepthKind.METRIC)
+    if name == "image-row":
+        return ImageRowPrior()
+    if name == "random-field":
+        return RandomSmoothPrior()
+    if name.startswith("noise-"):
+        # The unit is not given away: the paper's priors do not know it either.
+        return TrueDepthPrior(shot.depth, DepthKind.DEPTH, float(name.removeprefix("noise-")))
+    raise InputError(f"unknown prior {name}")
+
+
+def simulated_prior(name: str, data: Path, cache: Path) -> Path:
+    """Folder of the simulated prior's maps of a shot, made once by the script beside the data."""
+    folder = cache / "simulated" / name
+    if not folder.is_dir():
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder.parent) as scratch:
+            made = Path(scratch) / "maps"
+            script = [sys.executable, str(data / "simulate_prior.py"), str(shot_folder(data, name)), str(made)]
+            subprocess.run(script, check=True, stdout=subprocess.DEVNULL)
+            made.rename(folder)
+    return folder

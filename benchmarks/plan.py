@@ -1,0 +1,95 @@
+"""What is measured: experiments as named lists of cells (shot, variant, method, prior)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+STUDIO = (
+    "d01_livingroom_dolly_in",
+    "d02_livingroom_truck_actor",
+    "d03_livingroom_handheld",
+    "d04_warehouse_crane",
+    "d05_warehouse_walk_arc",
+    "d06_keep_static_breath",
+    "d07_keep_pan_trans_actor",
+    "d08_arena_pedestal",
+)
+KITCHEN = ("kitchen-000", "kitchen-528", "kitchen-840")
+SENSOR = (*KITCHEN, "hololens-110", "desk-9")
+REAL = (*SENSOR, "tsukuba-000", "tsukuba-100")
+UNORDERED = ("fountain-P11", "herzjesu-P8")
+WIDE_VIDEO = ("d09_livingroom_wide",)
+EDGE = ("d10_keep_tripod_pan", "euroc-static")
+
+COLMAP = ("colmap_default", "colmap_tuned", "colmap_global")
+PAPER = ("paper", "paper-init-only", "paper-opt-only")
+NO_PRIOR = "none"
+NETWORKS = ("tcmonodepth", "fastdepth")
+USELESS = ("image-row", "random-field")
+NOISE = ("noise-0", "noise-0.1", "noise-0.2", "noise-0.4")
+
+FULL, FIRST_10, FIRST_20, FEW, DEGRADED, CRF_30 = "full", "first-10", "first-20", "tracks-40", "degraded", "crf-30"
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One measurement.
+
+    Attributes:
+        shot: name of a data set's folder.
+        variant: what is done to the footage or the tracker, see `inputs.VARIANTS`.
+        method: a preset of factorsfm or a baseline.
+        prior: see `inputs.open_prior`; "none" for methods without one.
+    """
+
+    shot: str
+    variant: str
+    method: str
+    prior: str
+
+    def __str__(self) -> str:
+        return f"{self.shot}  {self.variant}  {self.method}  {self.prior}"
+
+
+def _cells(
+    shots: Iterable[str],
+    methods: Iterable[str],
+    priors: Iterable[str] = (NO_PRIOR,),
+    variants: Iterable[str] = (FULL,),
+) -> list[Cell]:
+    """All combinations; methods that read no prior appear once."""
+    cells = [
+        Cell(shot, variant, method, NO_PRIOR if method == "geometry" or method in COLMAP else prior)
+        for shot in shots
+        for variant in variants
+        for method in methods
+        for prior in priors
+    ]
+    return list(dict.fromkeys(cells))
+
+
+_BOTH = ("tcmonodepth", "simulated")
+_THREE = ("default", "paper", "geometry")
+
+EXPERIMENTS: dict[str, list[Cell]] = {
+    "pose": _cells(STUDIO, ("default", *PAPER, "geometry", *COLMAP), _BOTH),
+    "real": _cells(REAL, (*_THREE, *COLMAP), ("tcmonodepth",)),
+    # The methods for unordered images join here when there are any.
+    "wide": _cells(WIDE_VIDEO, ("default", "geometry"), ("tcmonodepth",)) + _cells((*UNORDERED, *WIDE_VIDEO), COLMAP),
+    "edge": _cells(EDGE, (*_THREE, *COLMAP), ("tcmonodepth",)),
+    "short": _cells(STUDIO, (*_THREE, "colmap_tuned"), _BOTH, (FIRST_10,))
+    + _cells(KITCHEN, (*_THREE, "colmap_tuned"), ("tcmonodepth",), (FIRST_10,)),
+    "few": _cells(STUDIO, _THREE, _BOTH, (FEW,)),
+    "degraded": _cells(STUDIO, (*_THREE, "colmap_tuned"), _BOTH, (DEGRADED, CRF_30)),
+    "useless": _cells(STUDIO, ("default", "geometry"), USELESS),
+    "networks": _cells(STUDIO, ("default",), (*NETWORKS, "simulated"))
+    + _cells(SENSOR, ("default",), (*NETWORKS, "sensor")),
+    "noise": _cells(STUDIO, ("default", "paper"), NOISE),
+}
+
+QUICK = {
+    "pose": _cells((STUDIO[2], STUDIO[5]), ("default", *PAPER, "geometry", *COLMAP), _BOTH, (FIRST_20,)),
+    "short": _cells((STUDIO[2], *KITCHEN[:1]), (*_THREE, "colmap_tuned"), ("tcmonodepth",), (FIRST_10,)),
+    "edge": _cells(EDGE[:1], ("default",), ("tcmonodepth",)),
+}

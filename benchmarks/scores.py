@@ -1,0 +1,116 @@
+"""Groups of records, and the numbers of a group."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.store import Record
+from factorsfm.evaluation.metrics import (
+    ATE_THRESHOLDS,
+    R_RPE_THRESHOLDS,
+    RELATIVE_POSE_THRESHOLDS,
+    T_RPE_THRESHOLDS,
+    DepthErrors,
+    auc,
+    relative_pose_errors,
+)
+
+Array = NDArray[np.float64]
+Records = Sequence[Record]
+
+_SHARE = 0.3  # of the shots that count as those with the largest, or the smallest, parallax
+
+
+class Label(NamedTuple):
+    """What a row of a table, or a line of a figure, stands for."""
+
+    method: str
+    prior: str
+
+    def __str__(self) -> str:
+        return self.method if self.prior == "none" else f"{self.method}, {self.prior}"
+
+
+def by_label(records: Records) -> dict[Label, list[Record]]:
+    """Records by method and prior, in the order of their first appearance."""
+    groups: dict[Label, list[Record]] = {}
+    for record in records:
+        groups.setdefault(Label(record.cell.method, record.cell.prior), []).append(record)
+    return groups
+
+
+def by_shot(records: Records) -> dict[str, list[Record]]:
+    """Records by shot, in the order of their names."""
+    groups: dict[str, list[Record]] = {}
+    for record in sorted(records, key=lambda record: record.cell.shot):
+        groups.setdefault(record.cell.shot, []).append(record)
+    return groups
+
+
+def parallax_of(record: Record) -> float | None:
+    """True parallax of the frames of the shot, None where it has no depth."""
+    value: float | None = record.facts["parallax"]
+    return value
+
+
+def smallest_parallax(records: Records) -> list[Record]:
+    """The records of the 30 % of shots with the smallest parallax, at least one."""
+    return _ranked(records, largest=False)
+
+
+def largest_parallax(records: Records) -> list[Record]:
+    """The records of the 30 % of shots with the largest parallax, at least one."""
+    return _ranked(records, largest=True)
+
+
+def _ranked(records: Records, largest: bool) -> list[Record]:
+    values = {record.cell.shot: value for record in records if (value := parallax_of(record)) is not None}
+    ranked = sorted(values, key=lambda shot: values[shot], reverse=largest)
+    chosen = ranked[: max(1, round(_SHARE * len(ranked)))]
+    return [record for record in records if record.cell.shot in chosen]
+
+
+def pooled_errors(records: Records) -> tuple[Array, Array, Array]:
+    """ATE, T-RPE and R-RPE of all frames of the records."""
+    errors = [record.errors for record in records]
+    return (
+        np.concatenate([e.ate for e in errors]),
+        np.concatenate([e.t_rpe for e in errors]),
+        np.concatenate([e.r_rpe for e in errors]),
+    )
+
+
+def pose_aucs(records: Records) -> list[float]:
+    """The six columns of the paper's table, pooled over all frames."""
+    thresholds = (ATE_THRESHOLDS, T_RPE_THRESHOLDS, R_RPE_THRESHOLDS)
+    return [
+        auc(errors, limit)
+        for errors, limits in zip(pooled_errors(records), thresholds, strict=True)
+        for limit in limits
+    ]
+
+
+def pooled_depth(records: Records) -> dict[str, float]:
+    """`DepthErrors.summary` of all points of the records."""
+    return DepthErrors.pool(record.depth_errors for record in records).summary()
+
+
+def within_at_own_scale(records: Records) -> float:
+    """Percent of the points within 5 % of the true depth after each record's depths are scaled to a median ratio of 1.
+
+    Says how good the shape is where the path is so short that the alignment hardly determines the scale.
+    """
+    ratios = [errors.estimate / errors.truth for errors in (record.depth_errors for record in records)]
+    scaled = np.concatenate([ratio / np.median(ratio) for ratio in ratios if len(ratio)] or [np.empty(0)])
+    return float(100.0 * (np.abs(scaled - 1.0) < 0.05).mean()) if len(scaled) else float("nan")
+
+
+def relative_pose_aucs(record: Record) -> list[float]:
+    """AUC of the relative poses of all pairs of frames, at 1, 5 and 20 degrees."""
+    a = record.arrays
+    errors = relative_pose_errors(a["rotations"], a["centers"], a["true_rotations"], a["true_centers"])
+    return [auc(errors, threshold) for threshold in RELATIVE_POSE_THRESHOLDS]

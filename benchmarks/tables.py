@@ -1,0 +1,345 @@
+"""Tables of all measurements, drawn from the cache: ``python -m benchmarks.tables`` draws them again."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks import figures
+from benchmarks.plan import COLMAP, DEGRADED, KITCHEN, STUDIO
+from benchmarks.scores import (
+    Label,
+    Records,
+    by_label,
+    by_shot,
+    largest_parallax,
+    parallax_of,
+    pooled_depth,
+    pose_aucs,
+    relative_pose_aucs,
+    smallest_parallax,
+    within_at_own_scale,
+)
+from benchmarks.store import Record, load
+
+HERE = Path(__file__).parent
+POSE = ("ATE 0.2 cm", "ATE 2 cm", "T-RPE 0.1 cm", "T-RPE 0.5 cm", "R-RPE 0.02°", "R-RPE 0.1°")
+WITHIN = ("points within 5 % of depth", "the same, at its own scale")
+DEPTH = (
+    ["within 5%", "delta<1.05", "delta<1.05^2", "delta<1.05^3", "delta<1.25", "delta<1.25^2", "delta<1.25^3"]
+    + [f"theta<{cm}cm" for cm in (1, 2, 5, 10, 25)]
+    + ["points"]
+)
+
+
+def draw(output: Path, cache: Path) -> None:
+    """Write RESULTS.md and the figures for the experiments in the manifest of the output folder."""
+    manifest = json.loads((output / "manifest.json").read_text())
+    experiments = {name: [load(cache / record) for record in facts["records"]] for name, facts in manifest.items()}
+    parts = ["# Results", _provenance(manifest, experiments)]
+    for name, (title, section) in SECTIONS.items():
+        if name in experiments:
+            parts += [f"## {title}", *section(experiments[name], output)]
+    parts += [*_no_harm(experiments), *_cost(experiments), *_failures(experiments)]
+    if any(parallax_of(record) for records in experiments.values() for record in records):
+        figures.parallax_histogram([r for records in experiments.values() for r in records], output / "parallax.png")
+        parts += ["## Parallax of the shots", "![Number of shots by parallax](parallax.png)"]
+    (output / "RESULTS.md").write_text("\n\n".join(parts) + "\n")
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[Any]], best: Callable[..., float] | None = None) -> str:
+    """A Markdown table; the best of each column of floats is bold where `best` (max or min) is given."""
+    rows = [list(row) for row in rows]
+    marks: dict[int, str] = {}
+    if best is not None and len(rows) > 1:
+        for column in range(len(header)):
+            values = [row[column] for row in rows if isinstance(row[column], float) and np.isfinite(row[column])]
+            if len({_text(value) for value in values}) > 1:
+                marks[column] = _text(best(values))
+    lines = [
+        [f"**{text}**" if marks.get(i) == (text := _text(value)) else _text(value) for i, value in enumerate(row)]
+        for row in rows
+    ]
+    align = ["---:" if rows and isinstance(rows[0][i], int | float) else "---" for i in range(len(header))]
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in [list(header), align, *lines])
+
+
+def _text(value: object) -> str:
+    if not isinstance(value, float):
+        return str(value)
+    if not np.isfinite(value):
+        return "–"
+    return f"{value:.1f}" if abs(value) < 1000 else f"{value:.0f}"
+
+
+def pose_table(records: Records) -> str:
+    """The six AUC columns by method and prior, pooled over all frames of the shots."""
+    rows = []
+    for label, members in by_label(records).items():
+        frames = sum(len(r.arrays["indices"]) for r in members)
+        registered = 100.0 * sum(r.registered for r in members) / frames
+        within = pooled_depth(members)["within 5%"], within_at_own_scale(members)
+        rows.append([*_names(label), len(members), *pose_aucs(members), registered, *within])
+    return table(["method", "prior", "shots", *POSE, "frames registered %", *WITHIN], rows, max)
+
+
+def shot_tables(records: Records) -> list[str]:
+    """The pose table of every shot."""
+    parts = []
+    for shot, members in by_shot(records).items():
+        value = parallax_of(members[0])
+        parts += [f"#### {shot}" + (f" (parallax {value:.3f})" if value else ""), pose_table(members)]
+    return parts
+
+
+def depth_table(records: Records) -> str:
+    """Depth of the observed points: relative and absolute accuracy in percent of the points."""
+    rows = [
+        [*_names(label), *(summary[key] for key in DEPTH)]
+        for label, members in by_label(records).items()
+        for summary in [pooled_depth(members)]
+    ]
+    return table(["method", "prior", *DEPTH], rows)
+
+
+def _pose(records: Records, output: Path) -> list[str]:
+    main = [r for r in records if r.cell.method not in ("paper-init-only", "paper-opt-only")]
+    variants = [r for r in records if r.cell.method not in COLMAP]
+    parts = [
+        "Area under the recall curve in percent, pooled over all frames; a frame that is not registered counts as an "
+        "infinite error. The best of each column is bold. Depths take their scale from the alignment of the paths; at its "
+        "own scale means that their median ratio to the truth is made 1.",
+        "### All shots",
+        pose_table(main),
+    ]
+    for title, chosen in (("largest", largest_parallax(main)), ("smallest", smallest_parallax(main))):
+        parts += [f"### The 30 % of shots with the {title} parallax ({_shots(chosen)})", pose_table(chosen)]
+    figures.recall_curves(main, output / "recall.png")
+    figures.recall_curves(smallest_parallax(main), output / "recall_small.png")
+    figures.error_against_parallax(main, output / "ate_parallax.png")
+    figures.depth_recall(main, output / "depth_recall.png")
+    return [
+        *parts,
+        "### Recall curves",
+        "All shots:\n\n![Recall curves of all shots](recall.png)",
+        "The shots with the smallest parallax:\n\n![Recall curves, smallest parallax](recall_small.png)",
+        "### Error against parallax",
+        "![Median ATE of each shot and method against the parallax](ate_parallax.png)",
+        "### Method variants",
+        pose_table(variants),
+        "### Depth of the points",
+        "Percent of the observed points with known true depth, away from its edges; scale from the alignment of the "
+        "trajectories. `delta`: ratio, `theta`: absolute.",
+        depth_table(records),
+        "![Recall of the point depths](depth_recall.png)",
+        "### Shot by shot",
+        *shot_tables(records),
+    ]
+
+
+def _real(records: Records, output: Path) -> list[str]:
+    """Median errors and the AUC of relative poses, shot by shot: references differ too much for pooling."""
+    rows = []
+    for shot, members in by_shot(records).items():
+        for label, (record,) in by_label(members).items():
+            errors, n = record.errors, len(record.arrays["indices"])
+            medians = [float(np.median(e)) for e in (errors.ate * 1e3, errors.t_rpe * 1e3)]
+            rotation = float(np.median(errors.r_rpe))
+            rows.append(
+                [
+                    *(shot, *_names(label), f"{record.registered}/{n}", *medians),
+                    f"{rotation:.3f}" if np.isfinite(rotation) else "–",
+                    *relative_pose_aucs(record),
+                    record.depth_errors.summary()["within 5%"],
+                    within_at_own_scale([record]),
+                ]
+            )
+    medians_of = ["ATE mm", "T-RPE mm", "R-RPE °"]
+    relative = ["pose AUC@1°", "@5°", "@20°"]
+    header = ["shot", "method", "prior", "frames", *medians_of, *relative, *WITHIN]
+    return ["Medians over the frames, and the AUC of the relative poses of all pairs in percent.", table(header, rows)]
+
+
+def _edge(records: Records, output: Path) -> list[str]:
+    rows = []
+    for shot, members in by_shot(records).items():
+        for label, (record,) in by_label(members).items():
+            angles, n = record.rotation_errors, len(record.arrays["indices"])
+            rows.append(
+                [
+                    *(shot, *_names(label), f"{record.registered}/{n}"),
+                    *(f"{value:.3f}" if np.isfinite(value) else "–" for value in (np.median(angles), angles.max())),
+                    record.facts.get("kind", "–"),
+                    " ".join(record.facts.get("notes", [])) or "–",
+                ]
+            )
+    header = ["shot", "method", "prior", "frames", "rotation error °, median", "largest", "reported as", "notes"]
+    return ["A camera that only turns, and one that stands still.", table(header, rows)]
+
+
+def _split(records: Records, output: Path) -> list[str]:
+    """Rendered shots and kitchen clips apart, pooled and shot by shot."""
+    parts = []
+    for title, shots in (("Rendered shots", STUDIO), ("Kitchen clips", KITCHEN)):
+        if members := [r for r in records if r.cell.shot in shots]:
+            parts += [f"### {title}", pose_table(members), *shot_tables(members)]
+    return parts
+
+
+def _pooled(records: Records, output: Path) -> list[str]:
+    return [pose_table(records), *shot_tables(records)]
+
+
+def _degraded(records: Records, output: Path) -> list[str]:
+    parts = []
+    for variant, members in _group(records, lambda r: r.cell.variant).items():
+        what = "Gaussian blur 1 px, noise sigma 8, JPEG quality 40" if variant == DEGRADED else "H.264 at CRF 30"
+        parts += [f"### {what}", pose_table(members), *shot_tables(members)]
+    return parts
+
+
+def _networks(records: Records, output: Path) -> list[str]:
+    parts = []
+    for title, rendered in (("Rendered shots", True), ("Real sets with sensor depth", False)):
+        if members := [r for r in records if (r.cell.shot in STUDIO) == rendered]:
+            parts += [f"### {title}", pose_table(members)]
+    return [*parts, "The depth of the points under the sensor's prior is judged against that same sensor."]
+
+
+SECTIONS: Mapping[str, tuple[str, Callable[[Records, Path], list[str]]]] = {
+    "pose": ("Camera path on shots with little parallax", _pose),
+    "real": ("Real and other clips", _real),
+    "wide": ("Wide baseline", _real),
+    "edge": ("Rotation only, and no motion", _edge),
+    "short": ("The first 10 frames", _split),
+    "few": ("At most 40 tracks", _pooled),
+    "degraded": ("Degraded footage, first 30 frames", _degraded),
+    "useless": ("Useless priors", _pooled),
+    "networks": ("Depth networks", _networks),
+    "noise": ("Noise on the true depth", _pooled),
+}
+
+
+def _no_harm(experiments: Mapping[str, Records]) -> list[str]:
+    """`default` against the better of `geometry` and `paper`, column by column."""
+    rows: list[list[Any]] = []
+    for name, records in experiments.items():
+        found = {(r.cell.shot, r.cell.variant, r.cell.method, r.cell.prior): r for r in records}
+        for (shot, variant, method, prior), record in found.items():
+            others = [(shot, variant, "geometry", "none"), (shot, variant, "paper", prior)]
+            rivals = [pose_aucs([found[key]]) for key in others if key in found]
+            if method == "default" and name != "edge" and rivals:
+                differences = np.array(pose_aucs([record])) - np.max(rivals, axis=0)
+                rows.append([name, shot, variant, prior, *(f"{d:+.1f}" for d in differences), float(differences.min())])
+    if not rows:
+        return []
+    rows.sort(key=lambda row: row[-1])
+    behind = sum(row[-1] < -3.0 for row in rows)
+    header = ["experiment", "shot", "variant", "prior", *POSE, "worst"]
+    return [
+        "## Default against the better of geometry and paper",
+        f"Points of AUC, shot by shot, worst first. More than 3 points behind in a column: {behind} of {len(rows)}.",
+        table(header, rows),
+    ]
+
+
+def _cost(experiments: Mapping[str, Records]) -> list[str]:
+    records = experiments.get("pose", [])
+    if not records:
+        return []
+    parts = [
+        "## Time and memory",
+        "From the video to the written result. Wall time depends on what else the machine does (its load at the start "
+        "is given), CPU time hardly. COLMAP's matching counts for each of its mappers, whose measurement shares it.",
+        "### Mean by method",
+    ]
+    stages: dict[str, None] = {}
+    for record in records:
+        stages |= dict.fromkeys(stage for stage in record.facts["seconds"] if stage != "total")
+    rows = []
+    for label, all_members in by_label(records).items():
+        members = [r for r in all_members if not r.facts["failed"]]
+        if members:
+            by_stage = [np.mean([r.facts["seconds"].get(stage, np.nan) for r in members]) for stage in stages]
+            rows.append([*_names(label), *map(float, by_stage), *map(float, np.mean([_costs(r) for r in members], 0))])
+    parts.append(table(["method", "prior", *stages, "total s", "CPU s", "peak MB", "load"], rows))
+    rows = []
+    for shot, members in by_shot(records).items():
+        labels = {label: record for label, (record,) in by_label(members).items() if not record.facts["failed"]}
+        tuned, ours = labels.get(Label("colmap_tuned", "none")), labels.get(Label("default", "tcmonodepth"))
+        if tuned and ours:
+            wall, cpu, *_ = np.array(_costs(tuned)) / np.array(_costs(ours))
+            rows.append([shot, *_costs(ours), *_costs(tuned), float(wall), float(cpu)])
+    if rows:
+        columns = [f"{who} {what}" for who in ("default", "tuned") for what in ("s", "CPU s", "MB", "load")]
+        header = ["shot", *columns, "ratio s", "ratio CPU s"]
+        parts += ["### Against tuned COLMAP", table(header, rows)]
+    return parts
+
+
+def _costs(record: Record) -> list[float]:
+    facts = record.facts
+    return [facts["seconds"]["total"], facts["cpu_seconds"], facts["peak_mb"], facts["load"]]
+
+
+def _failures(experiments: Mapping[str, Records]) -> list[str]:
+    failed = {
+        record.cell: record.facts["failed"]
+        for records in experiments.values()
+        for record in records
+        if record.facts["failed"]
+    }
+    rows = [[c.shot, c.variant, c.method, c.prior, reason] for c, reason in failed.items()]
+    header = ["shot", "variant", "method", "prior", "reason"]
+    return ["## Failures", table(header, rows) if rows else "None."]
+
+
+def _provenance(manifest: Mapping[str, Any], experiments: Mapping[str, Records]) -> str:
+    rows = [
+        [name, facts["commit"], facts["date"], len(experiments[name]), f"`{facts['command']}`"]
+        for name, facts in manifest.items()
+    ]
+    machines = dict.fromkeys(facts["machine"] for facts in manifest.values())
+    versions = dict.fromkeys(
+        ", ".join(f"{name} {number}" for name, number in facts["versions"].items()) for facts in manifest.values()
+    )
+    return "\n\n".join(
+        [
+            "Generated by `python -m benchmarks.run`; a + marks a commit with changes that are not committed.",
+            table(["experiment", "commit", "date", "cells", "command"], rows),
+            *(f"Machine: {machine}." for machine in machines),
+            *(f"Versions: {numbers}." for numbers in versions),
+        ]
+    )
+
+
+def _names(label: Label) -> tuple[str, str]:
+    return label.method, label.prior if label.prior != "none" else "–"
+
+
+def _shots(records: Records) -> str:
+    return ", ".join(shot.split("_")[0] for shot in by_shot(records))
+
+
+def _group(records: Records, key: Callable[[Record], str]) -> dict[str, list[Record]]:
+    groups: dict[str, list[Record]] = {}
+    for record in records:
+        groups.setdefault(key(record), []).append(record)
+    return groups
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.tables", description=__doc__)
+    parser.add_argument("--output", type=Path, default=HERE / "results", help="folder with the manifest of a run")
+    parser.add_argument("--cache", type=Path, default=HERE / "cache", help="folder of the records")
+    arguments = parser.parse_args()
+    draw(arguments.output, arguments.cache)
+
+
+if __name__ == "__main__":
+    main()
