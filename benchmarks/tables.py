@@ -112,8 +112,8 @@ def _pose(records: Records, output: Path) -> list[str]:
     variants = [r for r in records if r.cell.method not in COLMAP]
     parts = [
         "Area under the recall curve in percent, pooled over all frames; a frame that is not registered counts as an "
-        "infinite error. The best of each column is bold. Depths take their scale from the alignment of the paths; at its "
-        "own scale means that their median ratio to the truth is made 1.",
+        "infinite error. The best of each column is bold. Depths take their scale from the alignment of the paths; at "
+        "its own scale means that their median ratio to the truth is made 1.",
         "### All shots",
         pose_table(main),
     ]
