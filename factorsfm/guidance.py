@@ -76,7 +76,7 @@ class DepthGuidance:
         if n < _LEAST_POINTS:
             return None
         sigma = np.full(n, self.sigma(image, keyframes))
-        return DepthMeasurements(image.tracks.ids[use], depth.inverse_depth[use], sigma, image.affine)
+        return DepthMeasurements(image.tracks.ids[use], depth.inverse_depth[use], sigma, image.affine, depth.free_shift)
 
     def fallback(self, image: MappedImage, ids: Index) -> Array:
         """(n,) inverse distances where the views leave them open: from the image's prior, else the map's median."""

@@ -65,16 +65,23 @@ class Mapper:
             tracks = replace(tracks, depth=read_depth())
         image = MappedImage(tracks, FrameStatus.WAITING, "waiting for the start of the map")
         self.images.append(image)
-        if len(tracks.ids) < self.options.min_tracks:
+        try:
+            self._process(image, read_depth)
+        except Exception:  # a prior that fails, before anything changed: the image was never here
+            self.images.pop()
+            raise
+        return image
+
+    def _process(self, image: MappedImage, read_depth: Callable[[], ImageDepth | None]) -> None:
+        if len(image.tracks.ids) < self.options.min_tracks:
             image.status = FrameStatus.TOO_FEW_TRACKS
-            image.message = f"{len(tracks.ids)} of {self.options.min_tracks} needed tracks"
+            image.message = f"{len(image.tracks.ids)} of {self.options.min_tracks} needed tracks"
         elif not self._started:
             self._try_start(image, read_depth)
         else:
             self._register(image)
             if image.registered and self._is_keyframe(image):
                 self._add_keyframe(image, read_depth)
-        return image
 
     def finish(self) -> None:
         """No more images: start with what there is, if nothing better came."""

@@ -26,7 +26,7 @@ class Motion:
 
     Attributes:
         displacement_px: largest median displacement of the tracks against their first appearance.
-        gain: decrease of the cost by translation and depth, per observation.
+        gain: decrease of the cost by translation and depth, per observation of the median track.
         rotation_only: the solution without translation.
     """
 
@@ -68,7 +68,9 @@ def classify_motion(adjustment: BundleAdjustment, observations: Observations, op
         free_translation=False,
     )
     rotation_only.solve()
-    gain = (rotation_only.cost() - adjustment.cost()) / len(observations.xy)
+    difference = rotation_only.observation_costs() - adjustment.observation_costs()
+    # Median over the tracks: what moves by itself must not move the camera.
+    gain = float(np.median(np.add.reduceat(difference, start) / np.diff(np.append(start, len(difference)))))
     moved = displacement(observations)
     kind = ShotKind.ROTATION if moved > _STATIC_SHARE else ShotKind.STATIC
     if gain > _LEAST_GAIN:

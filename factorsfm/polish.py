@@ -113,7 +113,7 @@ def polish(
     adjustment.solve(o.final_iterations)
     if prior is not None:
         prior.residual = adjustment.prior_residuals()
-    camera_covariance, _ = adjustment.covariance(np.zeros(0, np.int64))
+    camera_covariance = _at_fixed_scale(adjustment.covariance(np.zeros(0, np.int64))[0], adjustment.state)
     k = len(frames)
     poses = np.stack([camera_covariance[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i in range(k)])
     if prior is not None:
@@ -275,9 +275,29 @@ def _temporal_inflation(adjustment: BundleAdjustment, observations: Observations
     inlier = size < 3.0 * np.median(size)
     pair = np.nonzero(next_one & inlier[:-1] & inlier[1:])[0]
     a, b = residual[pair], residual[pair + 1]
-    correlation = float((a * b).sum() / np.sqrt((a * a).sum() * (b * b).sum()))
+    power = float(np.sqrt((a * a).sum() * (b * b).sum()))
+    correlation = float((a * b).sum()) / max(power, 1e-12)
     correlation = min(max(correlation, 0.0), 0.9)
     return (1.0 + correlation) / (1.0 - correlation)
+
+
+def _at_fixed_scale(covariance: Array, state: State) -> Array:
+    """Covariance of the cameras and affines given the unit of length, which only weak priors hold.
+
+    Conditioned on no change along ``d``, the direction in which all translations and scales grow together.
+    """
+    k = len(state.rotation)
+    direction = np.zeros(len(covariance))
+    direction[: 6 * k].reshape(k, 6)[:, 3:] = -state.translation
+    direction[6 * k + 1 : 6 * k + 1 + 2 * len(state.scale) : 2] = state.scale
+    variable = np.nonzero(covariance.diagonal() > 0.0)[0]
+    d = direction[variable]
+    if not d.any():
+        return covariance
+    information = float(d @ np.linalg.solve(covariance[np.ix_(variable, variable)], d))
+    result = covariance.copy()
+    result[np.ix_(variable, variable)] -= np.outer(d, d) / max(information, 1e-300)
+    return result
 
 
 # --- long shots -------------------------------------------------------------------------------------------------

@@ -91,7 +91,8 @@ def measure_weight(angles: Array, inverse_depth: Array, prior: Array, covariance
             if score > best_score:
                 best, best_score = (float(smooth), float(local), share * extent), score
     certain = covariance.diagonal() < np.median(covariance.diagonal()) * 4.0
-    correlation = float(np.corrcoef(prior[certain], inverse_depth[certain])[0, 1]) if certain.sum() > 2 else 0.0
+    flat = certain.sum() < 3 or min(np.ptp(prior[certain]), np.ptp(inverse_depth[certain])) < 1e-6
+    correlation = 0.0 if flat else float(np.corrcoef(prior[certain], inverse_depth[certain])[0, 1])
     return PriorWeight(*best, correlation)
 
 

@@ -186,6 +186,10 @@ class BundleAdjustment:
         """Robust cost at the present state."""
         return self._cost(self.state)
 
+    def observation_costs(self) -> Array:
+        """(m,) robust cost of each observation; noise alone costs about one."""
+        return cauchy(self._reprojection(self.state)[0], self.options.kernel)[0]
+
     def _reprojection(self, state: State) -> tuple[Array, Array, Array]:
         o = self.observations
         q = state.camera_points(o.frame, o.point)
@@ -413,7 +417,7 @@ class BundleAdjustment:
     def solve(self, iterations: int | None = None) -> State:
         """Minimise; the result is also `self.state`."""
         damping = _FIRST_DAMPING
-        cost = self._cost(self.state)
+        cost = self.cost()
         for _ in range(iterations or self.options.iterations):
             normal = self._linearize()
             blocks = self._cross_blocks(normal)

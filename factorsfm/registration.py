@@ -116,11 +116,14 @@ def register_image(
         depth: prior at the same n keypoints; with ``domain="depth"`` the paper's residual with lambda `depth_weight`.
     """
     result = _refine(points, observed, rotation, translation, focal, sigma, inlier_px)
-    if result.inliers.mean() < 0.6 and len(points) >= 6:
+    doubtful = result.inliers.mean() < 0.6 or result.threshold > inlier_px
+    if doubtful and len(points) >= 6:
         start = _pnp_ransac(points, observed, focal, max(inlier_px, 2.0))
         if start is not None:
             other = _refine(points, observed, *start, focal, sigma, inlier_px)
-            if other.inliers.sum() > result.inliers.sum():
+            # Compared at the narrow threshold: a wide one counts what it was widened for.
+            errors = [_residuals(points, observed, r.rotation, r.translation, focal) for r in (result, other)]
+            if (errors[1] < inlier_px).sum() > (errors[0] < inlier_px).sum():
                 result = other
     if depth is None or not (use := result.inliers & depth.valid).sum() >= 10:
         return result
@@ -133,6 +136,11 @@ def _residuals(points: Array, observed: Array, rotation: Array, translation: Arr
     front = q[:, 2] > 1e-6
     error[front] = np.linalg.norm(reprojection(q[front], focal * observed[front], focal)[0], axis=1)
     return error
+
+
+def _typical(error: Array) -> float:
+    """What the median of the errors would be without outliers, which may be up to two thirds of them."""
+    return 1.39 * float(np.quantile(error, 0.3))
 
 
 def _optimize(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
@@ -154,16 +162,13 @@ def _refine(
     """Robust pose; the kernel follows the spread of the residuals, since a young map is not yet exact."""
     error = _residuals(points, observed, rotation, translation, focal)
     for _ in range(2):
-        finite = error[np.isfinite(error)]
-        spread = max(sigma, float(np.median(finite)) if len(finite) else sigma)
+        spread = min(max(sigma, _typical(error)), 100.0 * sigma)
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         graph.add(image_reprojection_factor(_POSE, points, observed, focal, spread, _KERNEL))
         values.insert(_POSE, pose_from_camera(rotation, translation))
         rotation, translation = camera_from_pose(_optimize(graph, values).atPose3(_POSE))
         error = _residuals(points, observed, rotation, translation, focal)
-    finite = error[np.isfinite(error)]
-    median = float(np.median(finite)) if len(finite) else float("inf")
-    threshold = max(inlier_px, min(4.0 * median, 8.0 * inlier_px))
+    threshold = max(inlier_px, min(4.0 * _typical(error), 8.0 * inlier_px))
     inliers = error < threshold
     typical = float(np.median(error[inliers])) if inliers.any() else float("inf")
     return Registration(rotation, translation, inliers, typical, threshold)
@@ -194,7 +199,7 @@ def _refine_with_depth(
     q = camera_points(result.rotation, result.translation, points[use], np.ones(int(use.sum())))
     measured = depth.inverse_depth[use]
     if domain == "inverse":
-        scale, shift, spread = fit_affine(1.0 / q[:, 2], measured)
+        scale, shift, spread = fit_affine(1.0 / q[:, 2], measured, free_shift=depth.free_shift)
         # All keypoints together count as one measurement per cell of correlated error (see `prior_weight`).
         depth_sigma = np.full(len(measured), max(spread, _DEPTH_FLOOR) * np.sqrt(max(1.0, len(measured) / 100.0)))
     else:

@@ -125,10 +125,10 @@ class Stream:
         undistorted = np.isfinite(xy).all(axis=1)  # a distortion model may have no inverse in the corners
         pixels = tracked.xy[undistorted]
         tracks = ImageTracks(len(self.frames), tracked.ids[undistorted], xy[undistorted])
-        self.frames.append(SeenFrame(frame.index, frame.name, frame.timestamp, tracked.texture))
-        self._pixels.append(pixels)
         with self._timed("mapping"):
             image = mapper.add(tracks, lambda: self._read_depth(frame, pixels))
+        self.frames.append(SeenFrame(frame.index, frame.name, frame.timestamp, tracked.texture))
+        self._pixels.append(pixels)
         self._tracker.drop(image.outliers)
         if image.status is not FrameStatus.WAITING:  # it may still take part in the start
             _mark_blank(image, tracked.texture)
