@@ -63,7 +63,7 @@ def classify_motion(adjustment: BundleAdjustment, observations: Observations, op
             bearing=rays / np.linalg.norm(rays, axis=1, keepdims=True),
         ),
         observations,
-        replace(options, iterations=15),
+        replace(options, iterations=6, tolerance=1e-2),
         sigma=adjustment.sigma,
         free_translation=False,
     )

@@ -96,7 +96,7 @@ class PolishOptions:
     kernel: float = 2.0
     min_track_length: int = 5
     point_sigma: float = 1.0
-    outlier_sigmas: float = 5.0
+    outlier_sigmas: float = 3.0
     max_frames: int = 400
 
 

@@ -146,7 +146,7 @@ def _typical(error: Array) -> float:
 def _optimize(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(20)
-    parameters.setRelativeErrorTol(1e-6)
+    parameters.setRelativeErrorTol(1e-5)
     return gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
 
 

@@ -135,7 +135,7 @@ class FlowTracker:
             self._xy.copy(),
             winSize=(o.window_px, o.window_px),
             maxLevel=0,
-            criteria=_CRITERIA,
+            criteria=_FINE,
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         )
         back, status_back, _ = cv2.calcOpticalFlowPyrLK(
@@ -145,7 +145,7 @@ class FlowTracker:
             centers.copy(),
             winSize=(o.window_px, o.window_px),
             maxLevel=0,
-            criteria=_CRITERIA,
+            criteria=_FINE,
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         )
         good = (status[:, 0] == 1) & (status_back[:, 0] == 1)
@@ -182,7 +182,9 @@ class FlowTracker:
         return m
 
 
-_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.003)
+_STOP = cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS
+_COARSE = (_STOP, 12, 0.02)  # from frame to frame: the re-alignment does the rest
+_FINE = (_STOP, 30, 0.003)
 
 
 def _texture(grey: Image) -> float:
@@ -195,9 +197,9 @@ def _flow_checked(
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Flow a -> b of points, and whether the way back, tried from where it should end, stays there."""
     side = (window, window)
-    forward, status, _ = cv2.calcOpticalFlowPyrLK(a, b, xy, None, winSize=side, maxLevel=levels, criteria=_CRITERIA)
+    forward, status, _ = cv2.calcOpticalFlowPyrLK(a, b, xy, None, winSize=side, maxLevel=levels, criteria=_COARSE)
     back, status_back, _ = cv2.calcOpticalFlowPyrLK(
-        b, a, forward, xy.copy(), winSize=side, maxLevel=1, criteria=_CRITERIA,
+        b, a, forward, xy.copy(), winSize=side, maxLevel=1, criteria=_COARSE,
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )  # fmt: skip
     ok = (status[:, 0] == 1) & (status_back[:, 0] == 1)
