@@ -35,7 +35,8 @@ from factorsfm.factors import (
 )
 from factorsfm.graph import DepthMeasurements, FactorGraph, Keyframe
 from factorsfm.options import PolishOptions
-from factorsfm.refinement import BundleAdjustment, Observations, State
+from factorsfm.problem import Observations, State
+from factorsfm.refinement import BundleAdjustment
 from factorsfm.registration import ImageDepth, register_image
 from factorsfm.synthetic import render_shot, synthetic_scene
 from factorsfm.tracks.flow import FlowTracker

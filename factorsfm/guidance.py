@@ -11,7 +11,7 @@ from factorsfm.graph import DepthMeasurements
 from factorsfm.images import MappedImage, gather
 from factorsfm.options import MapperOptions
 from factorsfm.point_map import PointMap
-from factorsfm.refinement import PriorObservations
+from factorsfm.problem import PriorObservations
 from factorsfm.registration import fit_affine
 
 Array = NDArray[np.float64]

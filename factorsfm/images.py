@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.problem import Observations
 from factorsfm.reconstruction import FrameStatus
-from factorsfm.refinement import Observations
 from factorsfm.registration import ImageDepth
 
 Array = NDArray[np.float64]

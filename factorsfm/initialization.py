@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.images import ImageTracks
-from factorsfm.refinement import Observations
+from factorsfm.problem import Observations
 from factorsfm.registration import ImageDepth, register_image
 from factorsfm.triangulation import triangulate
 

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.options import PolishOptions
+from factorsfm.problem import Observations, State
 from factorsfm.reconstruction import ShotKind
-from factorsfm.refinement import BundleAdjustment, Observations, State
+from factorsfm.refinement import BundleAdjustment
 
 Array = NDArray[np.float64]
 

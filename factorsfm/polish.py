@@ -13,8 +13,9 @@ from factorsfm.images import MappedImage, gather
 from factorsfm.observability import Motion, classify_motion
 from factorsfm.options import Options, PolishOptions
 from factorsfm.prior_term import PriorPart, joint_problem, weigh_prior
+from factorsfm.problem import Observations, State
 from factorsfm.reconstruction import ShotKind
-from factorsfm.refinement import BundleAdjustment, Observations, State
+from factorsfm.refinement import BundleAdjustment
 from factorsfm.registration import register_image
 from factorsfm.triangulation import triangulate
 

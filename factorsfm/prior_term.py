@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from factorsfm.images import MappedImage
 from factorsfm.options import PolishOptions
 from factorsfm.prior_weight import PriorWeight, direction_angles, field_grid, measure_weight, sample_points
-from factorsfm.refinement import BundleAdjustment, Observations, PriorObservations, State
+from factorsfm.problem import Observations, PriorObservations, State
+from factorsfm.refinement import BundleAdjustment
 from factorsfm.registration import fit_affine
 
 Array = NDArray[np.float64]

@@ -6,10 +6,9 @@ keyframes are a handful of independent measurements. The error of the prior is m
     ``d = a (1 / z + e(direction) + n) + b``,
 
 with a smooth field ``e`` that belongs to the scene (shared by all images, exponential correlation over the viewing
-direction) and a local rest ``n``. Their sizes maximise the likelihood of the differences between the prior and the
-geometry, whose own joint covariance is known, with a weak prior on what networks are usually like: where
-geometry is precise the differences show the network's error,
-where it is silent they say nothing and are not mistaken for precision.
+direction) and a local rest ``n``. Their sizes are the most probable ones given the differences between the prior and
+the geometry, whose own joint covariance is known, and given what networks are usually like: where geometry is precise
+the differences show the network's error, where it is silent they say nothing and are not mistaken for precision.
 """
 
 from __future__ import annotations

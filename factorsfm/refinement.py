@@ -8,13 +8,14 @@ distance, in which small motion is almost linear.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.factors import affine_inverse_depth, by_pose, camera_points, cauchy, reprojection
+from factorsfm.factors import affine_inverse_depth, by_pose, cauchy, reprojection
 from factorsfm.options import PolishOptions
+from factorsfm.problem import Observations, PriorObservations, State
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -22,78 +23,6 @@ Index = NDArray[np.int64]
 _CHUNK = 512  # points eliminated together
 _FIRST_DAMPING = 1e-4
 _LARGEST_DAMPING = 1e6
-
-
-@dataclass(frozen=True, slots=True)
-class Observations:
-    """m observations of n points in k frames, sorted by point.
-
-    Attributes:
-        frame, point: (m,) indices.
-        xy: (m, 2) undistorted normalised image coordinates.
-    """
-
-    frame: Index
-    point: Index
-    xy: Array
-
-
-@dataclass(frozen=True, slots=True)
-class PriorObservations:
-    """Values of the depth prior at observations, sorted by point.
-
-    Attributes:
-        image: (m,) which affine; frame, point: (m,) as in `Observations`.
-        inverse_depth: (m,) values of the prior's maps.
-        sigma: (m,) standard deviation of the independent part of the error.
-        nodes, node_weights: (m, 4) nodes of the smooth error field around each point and their weights.
-        field_information: (nodes, nodes) inverse covariance of the field.
-        scale_sigma, shift_sigma: priors of each affine around 1 and 0 (scale: of the logarithm).
-    """
-
-    image: Index
-    frame: Index
-    point: Index
-    inverse_depth: Array
-    sigma: Array
-    nodes: Index
-    node_weights: Array
-    field_information: Array
-    scale_sigma: float
-    shift_sigma: float
-
-
-@dataclass(slots=True)
-class State:
-    """All variables.
-
-    Attributes:
-        rotation (k, 3, 3), translation (k, 3): `cam_from_world`.
-        bearing (n, 3) unit, inverse_distance (n,): points seen from the world's origin.
-        log_focal: logarithm of the focal length in pixels.
-        scale, shift: (images,) affine of each image with a prior.
-        field: (nodes,) smooth error of the prior in units of inverse depth, shared by all its images.
-    """
-
-    rotation: Array
-    translation: Array
-    bearing: Array
-    inverse_distance: Array
-    log_focal: float
-    scale: Array = field(default_factory=lambda: np.zeros(0))
-    shift: Array = field(default_factory=lambda: np.zeros(0))
-    field: Array = field(default_factory=lambda: np.zeros(0))
-
-    @property
-    def points(self) -> Array:
-        """(n, 3) Euclidean points; those at infinity end up very far away."""
-        return self.bearing / np.maximum(self.inverse_distance, 1e-9)[:, None]
-
-    def camera_points(self, frame: Index, point: Index) -> Array:
-        """(m, 3) homogeneous camera-frame vectors `q` of `factors.camera_points`."""
-        return camera_points(
-            self.rotation[frame], self.translation[frame], self.bearing[point], self.inverse_distance[point]
-        )
 
 
 @dataclass(frozen=True, slots=True)

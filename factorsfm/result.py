@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from factorsfm.images import MappedImage
 from factorsfm.polish import FOCAL_STD, Polished
+from factorsfm.problem import State
 from factorsfm.reconstruction import FrameResult, FrameStatus, PriorFit, Reconstruction, ShotKind
-from factorsfm.refinement import State
 
 Array = NDArray[np.float64]
 
@@ -76,7 +76,7 @@ def assemble(
         at = np.searchsorted(key, (p.observations.point * (len(positions) + 1) + p.observations.frame)[order])
         predicted = p.residual + p.observations.inverse_depth - state.shift[p.observations.image]
         prior_residual[at] = (p.residual / np.maximum(np.abs(predicted), 1e-6))[order]
-    result = Reconstruction(
+    return Reconstruction(
         camera=camera,
         frames=_frame_results(polished, images, frames, unit),
         points=points,
@@ -94,7 +94,6 @@ def assemble(
         seconds=seconds,
         options=options,
     )
-    return result
 
 
 def _usable_points(polished: Polished) -> tuple[NDArray[np.intp], NDArray[np.int64]]:

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from factorsfm.factors import camera_points, reprojection
 from factorsfm.options import PolishOptions
-from factorsfm.refinement import BundleAdjustment, Observations, PriorObservations, State
+from factorsfm.problem import Observations, PriorObservations, State
+from factorsfm.refinement import BundleAdjustment
 
 Array = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ import numpy as np
 import pycolmap
 
 from factorsfm.camera import normalized_from_pixels
-from factorsfm.refinement import Observations, State
+from factorsfm.problem import Observations, State
 from factorsfm.synthetic import synthetic_scene
 
 

@@ -6,8 +6,9 @@ from estimation_problems import angles_between, make_problem, perturbed
 
 from factorsfm.observability import classify_motion, displacement
 from factorsfm.options import PolishOptions
+from factorsfm.problem import Observations
 from factorsfm.reconstruction import ShotKind
-from factorsfm.refinement import BundleAdjustment, Observations
+from factorsfm.refinement import BundleAdjustment
 
 OPTIONS = PolishOptions()
 

@@ -16,7 +16,8 @@ from factorsfm.factors import (
     virtual_offset,
 )
 from factorsfm.options import PolishOptions
-from factorsfm.refinement import BundleAdjustment, Observations, PriorObservations
+from factorsfm.problem import Observations, PriorObservations
+from factorsfm.refinement import BundleAdjustment
 
 # A tight tolerance and hardly any prior on the points: the optimum is that of the reprojections (and the prior).
 EXACT = PolishOptions(iterations=60, tolerance=1e-12, point_sigma=1e3)

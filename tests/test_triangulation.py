@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from estimation_problems import make_problem
 
-from factorsfm.refinement import Observations, PriorObservations
+from factorsfm.problem import Observations, PriorObservations
 from factorsfm.triangulation import triangulate
 
 SETTINGS = {"inlier_px": 3.0, "sigma": 0.25}
