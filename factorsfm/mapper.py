@@ -263,15 +263,17 @@ class Mapper:
         for position, (rotation, translation) in self.graph.poses().items():
             self.images[position].rotation, self.images[position].translation = rotation, translation
         image.affine = self.graph.affine(tracks.position) or image.affine
-        image.outliers = tracks.ids[self.points.contains(tracks.ids) & ~self._explained(image)]
+        # Only what is grossly wrong: a young map is, too, and long tracks are precious.
+        gross = self.points.contains(tracks.ids) & ~self._explained(image, leniency=4.0)
+        image.outliers = tracks.ids[gross]
 
-    def _explained(self, image: MappedImage) -> NDArray[np.bool_]:
+    def _explained(self, image: MappedImage, leniency: float = 1.0) -> NDArray[np.bool_]:
         """Which tracks have a point that projects where it was seen, within the widened inlier threshold."""
         mapped = self.points.contains(image.tracks.ids)
         error = self.points.reprojection_errors(image, mapped) * self.focal
         limit = max(self.options.inlier_px, 5.0 * float(np.median(error)) if len(error) else 0.0)
         explained = mapped.copy()
-        explained[mapped] = error < limit
+        explained[mapped] = error < leniency * limit
         return explained
 
     def _new_landmarks(self, image: MappedImage, known: NDArray[np.bool_]) -> tuple[Index, Array]:
