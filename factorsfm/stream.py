@@ -122,9 +122,10 @@ class Stream:
             tracked = self._tracker.track(frame.image, mask)
         self._remember_colors(frame.image, tracked.ids, tracked.xy)
         xy = normalized_from_pixels(self.camera, tracked.xy)
-        undistorted = np.isfinite(xy).all(axis=1)  # a distortion model may have no inverse in the corners
-        pixels = tracked.xy[undistorted]
-        tracks = ImageTracks(len(self.frames), tracked.ids[undistorted], xy[undistorted])
+        usable = np.isfinite(xy).all(axis=1)  # a distortion model may have no inverse in the corners
+        usable &= tracked.texture >= _BLANK_TEXTURE  # what is tracked in a blank image is its noise
+        pixels = tracked.xy[usable]
+        tracks = ImageTracks(len(self.frames), tracked.ids[usable], xy[usable])
         with self._timed("mapping"):
             image = mapper.add(tracks, lambda: self._read_depth(frame, pixels))
         self.frames.append(SeenFrame(frame.index, frame.name, frame.timestamp, tracked.texture))
