@@ -27,6 +27,7 @@ logger = logging.getLogger(__name__)
 _FIRST_SIGMA_PX = 0.25
 _SMALLEST_SIGMA_PX = 0.03
 _RAYLEIGH_MEDIAN = 1.1774  # median of the norm of a 2-D error, in standard deviations
+_DOUBTFUL_INFLATION = 3.0  # sound solutions have 1 to 2
 _CORE_TRACKS = 400  # tracks with which the cameras converge first
 _TRIANGULATION_VIEWS = 10
 # Relative standard deviation up to which a focal length counts as determined. It knows nothing of systematic tracking
@@ -213,11 +214,25 @@ def _noise(errors: Array) -> float:
 def _converge_cameras(
     state: State, observations: Observations, options: Options
 ) -> tuple[Index, Observations, BundleAdjustment]:
-    """All cameras on the core tracks, first with a wide kernel: the points, their observations, the solution."""
-    o = options.polish
+    """All cameras on the core tracks: the points, their observations, the solution.
+
+    Residuals that repeat themselves for many frames say that the solution is not one: the incremental map may have
+    been bent or depth-reversed beyond repair. Other starts are tried then, and the best fit is kept.
+    """
     core = _core(observations, len(state.rotation), _CORE_TRACKS)
     few = _subset(observations, core)
     part = replace(state, bearing=state.bearing[core], inverse_distance=state.inverse_distance[core])
+    best = _solve_core(part, few, options)
+    if _temporal_inflation(best, few) > _DOUBTFUL_INFLATION:
+        logger.info("the solution does not fit (%.2f px), trying other starts", best.sigma)
+        best = min(best, _solve_core(_flat(part, few, options.polish), few, options), key=lambda b: b.sigma)
+        best = min(best, _solve_core(_reversed(best.state), few, options), key=lambda b: b.sigma)
+    return core, few, best
+
+
+def _solve_core(part: State, few: Observations, options: Options) -> BundleAdjustment:
+    """Converged from one start, first with a wide kernel."""
+    o = options.polish
     errors = BundleAdjustment(part, few, o, sigma=1.0).reprojection_errors()
     sigma = max(_FIRST_SIGMA_PX, _noise(errors))
     adjustment = BundleAdjustment(part, few, replace(o, iterations=20, tolerance=1e-3), sigma=sigma)
@@ -227,7 +242,25 @@ def _converge_cameras(
     adjustment.solve()
     logger.debug("cameras: %d iterations, %.3f px", adjustment.iterations, sigma)
     adjustment.sigma = _noise(adjustment.reprojection_errors())
-    return core, few, adjustment
+    return adjustment
+
+
+def _flat(part: State, few: Observations, options: PolishOptions) -> State:
+    """Rotations alone, all points at one distance: a start that takes no side."""
+    still = replace(
+        part,
+        translation=np.zeros_like(part.translation),
+        inverse_distance=np.full(len(part.inverse_distance), float(np.median(part.inverse_distance))),
+    )
+    rotating = BundleAdjustment(still, few, replace(options, iterations=15), sigma=1.0, free_translation=False)
+    return rotating.solve()
+
+
+def _reversed(part: State) -> State:
+    """Near and far exchanged and the motion turned round: in a narrow view almost the same images."""
+    center = float(np.median(part.inverse_distance))
+    inverse = np.clip(2.0 * center - part.inverse_distance, 0.05 * center, 4.0 * center)
+    return replace(part, translation=-part.translation, inverse_distance=inverse)
 
 
 def _with_part(state: State, part: State, core: Index) -> State:
