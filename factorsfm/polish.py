@@ -28,6 +28,7 @@ _FIRST_SIGMA_PX = 0.25
 _SMALLEST_SIGMA_PX = 0.03
 _RAYLEIGH_MEDIAN = 1.1774  # median of the norm of a 2-D error, in standard deviations
 _DOUBTFUL_INFLATION = 3.0  # sound solutions have 1 to 2
+_DOUBTFUL_SIGMA_PX = 0.2  # sound solutions have 0.04 to 0.15, also of degraded footage
 _CORE_TRACKS = 400  # tracks with which the cameras converge first
 _TRIANGULATION_VIEWS = 10
 # Relative standard deviation up to which a focal length counts as determined. It knows nothing of systematic tracking
@@ -216,14 +217,14 @@ def _converge_cameras(
 ) -> tuple[Index, Observations, BundleAdjustment]:
     """All cameras on the core tracks: the points, their observations, the solution.
 
-    Residuals that repeat themselves for many frames say that the solution is not one: the incremental map may have
-    been bent or depth-reversed beyond repair. Other starts are tried then, and the best fit is kept.
+    Residuals that are large, or repeat themselves for many frames, say that the solution is not one: the incremental
+    map may have been bent or depth-reversed beyond repair. Other starts are tried then, and the best fit is kept.
     """
     core = _core(observations, len(state.rotation), _CORE_TRACKS)
     few = _subset(observations, core)
     part = replace(state, bearing=state.bearing[core], inverse_distance=state.inverse_distance[core])
     best = _solve_core(part, few, options)
-    if _temporal_inflation(best, few) > _DOUBTFUL_INFLATION:
+    if best.sigma > _DOUBTFUL_SIGMA_PX or _temporal_inflation(best, few) > _DOUBTFUL_INFLATION:
         logger.info("the solution does not fit (%.2f px), trying other starts", best.sigma)
         best = min(best, _solve_core(_flat(part, few, options.polish), few, options), key=lambda b: b.sigma)
         best = min(best, _solve_core(_reversed(best.state), few, options), key=lambda b: b.sigma)

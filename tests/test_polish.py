@@ -1,0 +1,72 @@
+"""The polish from bad starts: what the incremental map got wrong must not be final."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from estimation_problems import angles_between, in_unit_of, make_problem
+
+from factorsfm.images import MappedImage
+from factorsfm.initialization import ImageTracks
+from factorsfm.options import Options
+from factorsfm.polish import polish
+from factorsfm.reconstruction import FrameStatus, ShotKind
+
+
+def images_of(problem, state):
+    """Mapped images with the poses of `state` and the tracks of the problem."""
+    images = []
+    for k in range(len(state.rotation)):
+        ids, xy = problem.of_frame(k)
+        image = MappedImage(ImageTracks(k, ids, xy), FrameStatus.REGISTERED, "")
+        image.rotation, image.translation = state.rotation[k], state.translation[k]
+        images.append(image)
+    return images
+
+
+def reversed_depth(state):
+    """Near and far exchanged, the motion turned round."""
+    return replace(
+        state, translation=-state.translation, inverse_distance=np.clip(2.0 - state.inverse_distance, 0.1, 4)
+    )
+
+
+def bent(state):
+    """Points at random distances, and a path that has nothing to do with the true one."""
+    rng = np.random.default_rng(1)
+    path = 0.03 * rng.standard_normal(state.translation.shape)
+    path[0] = 0.0
+    return replace(state, translation=path, inverse_distance=rng.uniform(0.3, 2.0, len(state.inverse_distance)))
+
+
+@pytest.mark.parametrize("damage", [lambda state: state, reversed_depth, bent], ids=["sound", "reversed", "bent"])
+@pytest.mark.parametrize("motion", ["truck", "handheld"])
+def test_the_truth_is_found_from_a_damaged_map(motion, damage):
+    problem = make_problem(motion, frames=12, points=200, parallax=0.05, noise_px=0.1)
+    start = damage(problem.truth)
+    points = np.arange(len(start.bearing)), start.points
+    result = polish(images_of(problem, start), points, problem.focal, Options.preset_named("geometry"))
+    assert result.motion.kind is ShotKind.GENERAL
+    state = in_unit_of(result.state, problem_truth := replace(
+        problem.truth,
+        bearing=problem.truth.bearing[result.tracks],
+        inverse_distance=problem.truth.inverse_distance[result.tracks],
+    ))  # fmt: skip
+    assert angles_between(state.rotation, problem_truth.rotation).max() < 3e-3
+    path = np.linalg.norm(problem_truth.translation, axis=1).max()
+    error = np.linalg.norm(state.translation - problem_truth.translation, axis=1).max()
+    assert 1e-5 * path < error < 0.1 * path
+    assert 0.05 < result.sigma < 0.15
+    assert len(result.tracks) > 0.9 * len(start.bearing)
+
+
+def test_a_long_shot_registers_the_frames_between_on_the_polished_points():
+    problem = make_problem("truck", frames=12, points=200, parallax=0.05, noise_px=0.1)
+    options = Options.preset_named("geometry")
+    options = replace(options, polish=replace(options.polish, max_frames=6))
+    points = np.arange(len(problem.truth.bearing)), problem.truth.points
+    result = polish(images_of(problem, problem.truth), points, problem.focal, options)
+    assert result.frames == list(range(12))
+    assert result.covariance.shape == (12, 6, 6)
+    assert angles_between(result.state.rotation, problem.truth.rotation).max() < 1e-3
+    assert np.median(result.errors) == pytest.approx(0.118, rel=0.2)
