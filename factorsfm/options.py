@@ -91,8 +91,8 @@ class PolishOptions:
 
     depth: bool = True
     iterations: int = 60
-    final_iterations: int = 6
-    tolerance: float = 3e-5
+    final_iterations: int = 4
+    tolerance: float = 1e-4
     kernel: float = 2.0
     min_track_length: int = 5
     point_sigma: float = 1.0
