@@ -19,6 +19,7 @@ from factorsfm.factors import (
     pose_from_camera,
     virtual_offset,
 )
+from factorsfm.registration import KNOWN_SHIFT_SIGMA, SCALE_SIGMA, SHIFT_SIGMA
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -26,9 +27,6 @@ Index = NDArray[np.int64]
 logger = logging.getLogger(__name__)
 
 _LANDMARK_SIGMA = 1.0  # weak prior of every landmark, in units of its depth: keeps the system determined
-_SCALE_SIGMA = 0.5  # prior of the logarithm of a scale, around its robust fit
-_NO_SHIFT_SIGMA = 0.02
-_SHIFT_SIGMA = 0.3  # prior of a shift, in units of the image's median inverse depth
 _ROBUST_KERNEL = 2.0
 
 
@@ -138,13 +136,13 @@ class FactorGraph:
             graph.add(gtsam.PriorFactorPose3(T(0), virtual_offset(), gtsam.noiseModel.Isotropic.Sigma(6, 1e-8)))
         scale, shift = depth.affine
         values.insert(A(position), native_affine(scale, shift))
-        shift_sigma = _SHIFT_SIGMA if depth.free_shift else _NO_SHIFT_SIGMA
+        shift_sigma = SHIFT_SIGMA if depth.free_shift else KNOWN_SHIFT_SIGMA
         center = float(np.median(depth.inverse_depth))
         graph.add(
             gtsam.PriorFactorCal3_S2(
                 A(position),
                 native_affine(scale, 0.0),
-                native_affine_noise(_SCALE_SIGMA * scale, shift_sigma * center),
+                native_affine_noise(SCALE_SIGMA * scale, shift_sigma * center),
             )
         )
         for track, value, sigma in zip(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,7 +57,6 @@ class Polished:
     covariance: Array
     prior: PriorPart | None = None
     focal_std: float | None = None
-    notes: list[str] = field(default_factory=list)
 
 
 def polish(

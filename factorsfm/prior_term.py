@@ -13,7 +13,7 @@ from factorsfm.options import PolishOptions
 from factorsfm.prior_weight import PriorWeight, direction_angles, field_grid, measure_weight, sample_points
 from factorsfm.problem import Observations, PriorObservations, State
 from factorsfm.refinement import BundleAdjustment
-from factorsfm.registration import fit_affine
+from factorsfm.registration import KNOWN_SHIFT_SIGMA, SCALE_SIGMA, SHIFT_SIGMA, fit_affine
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -21,7 +21,6 @@ Index = NDArray[np.int64]
 logger = logging.getLogger(__name__)
 
 _LEAST_CORRELATION = 0.1  # with the reconstructed inverse depth; below this, or mirrored, a prior is none
-_SCALE_SIGMA, _SHIFT_SIGMA, _NO_SHIFT_SIGMA = 0.5, 0.3, 0.02
 
 
 @dataclass(slots=True)
@@ -104,8 +103,8 @@ def joint_problem(
     prior = PriorObservations(
         values.image, observations.frame[values.at], point, values.inverse_depth,
         rest[point] * weighed.scale[values.image] * np.sqrt(count),
-        nodes[point], node_weights[point], information, _SCALE_SIGMA,
-        _SHIFT_SIGMA if values.free_shift else _NO_SHIFT_SIGMA,
+        nodes[point], node_weights[point], information, SCALE_SIGMA,
+        SHIFT_SIGMA if values.free_shift else KNOWN_SHIFT_SIGMA,
     )  # fmt: skip
     state = replace(state, scale=weighed.scale, shift=weighed.shift, field=np.zeros(len(information)))
     joint = BundleAdjustment(state, observations, options, sigma=sigma, prior=prior)

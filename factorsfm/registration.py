@@ -27,6 +27,11 @@ _KERNEL = 2.0  # Cauchy scale in standard deviations
 _DEPTH_FLOOR = 0.03  # smallest believable relative error of a depth network
 
 
+SCALE_SIGMA = 0.5  # relative prior of the scale of an image's depth
+SHIFT_SIGMA = 0.3  # prior of its shift around 0, in units of the image's median inverse depth
+KNOWN_SHIFT_SIGMA = 0.02  # the same where the prior knows its zero (depth, metric depth)
+
+
 @dataclass(frozen=True, slots=True)
 class ImageDepth:
     """Depth prior at the keypoints of one image, NaN where it is invalid.

@@ -16,6 +16,8 @@ from factorsfm.reconstruction import FrameResult, FrameStatus, PriorFit, Reconst
 
 Array = NDArray[np.float64]
 
+_INLIER_SIGMAS = 8.0  # reprojection error up to which an observation counts as explained
+
 
 class SeenFrame(Protocol):
     """What the result needs to know of a frame."""
@@ -137,7 +139,7 @@ def _frame_results(
     polished: Polished, images: list[MappedImage], frames: Sequence[SeenFrame], unit: float
 ) -> list[FrameResult]:
     state, o = polished.state, polished.observations
-    threshold = 4.0 * polished.sigma * 2.0
+    threshold = _INLIER_SIGMAS * polished.sigma
     seen = np.bincount(o.frame, minlength=len(polished.frames))
     inliers = np.bincount(o.frame, polished.errors < threshold, len(polished.frames)).astype(int)
     error = np.array([float(np.median(polished.errors[o.frame == k])) if n else np.nan for k, n in enumerate(seen)])
@@ -188,7 +190,8 @@ def _prior_fits(polished: Polished, images: list[MappedImage], unit: float) -> d
 
 
 def _notes(polished: Polished, has_depth: bool, focal_guessed: bool) -> list[str]:
-    notes, motion = list(polished.notes), polished.motion
+    notes: list[str] = []
+    motion = polished.motion
     depths = "depths and their scale come from the prior alone" if has_depth else "depths are unknown without a prior"
     if motion.kind is ShotKind.STATIC:
         notes.append(
