@@ -1,208 +1,169 @@
-"""The incremental factor graph: keyframes, landmarks and prior affines in iSAM2, updated as transactions."""
+"""The incremental factor graph: keyframe poses and prior affines in iSAM2, the landmarks condensed into one factor.
+
+In shots with little parallax every keyframe sees every landmark, and a general solver eliminates nearly all of them
+again at every update (60 keyframes: half a second). So the landmarks never become variables of iSAM2. Their
+observations and depth-consistency residuals are linearised in numpy, the landmarks eliminated, and what they say of
+the keyframes enters as one container factor, which each step replaces by its slot; iSAM2 forgets the variables of
+keyframes that have left the window, and gives the covariances of the others.
+"""
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import A, L, T, X
+from gtsam.symbol_shorthand import A, F, X
 from numpy.typing import NDArray
 
-from factorsfm.factors import (
-    affine_of_native,
-    camera_from_pose,
-    native_affine,
-    native_affine_noise,
-    native_depth_factor,
-    pose_from_camera,
-    virtual_offset,
-)
-from factorsfm.registration import KNOWN_SHIFT_SIGMA, SCALE_SIGMA, SHIFT_SIGMA
+from factorsfm.factors import pose_from_camera
+from factorsfm.problem import State
+from factorsfm.refinement import BundleAdjustment
 
 Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 logger = logging.getLogger(__name__)
 
-_LANDMARK_SIGMA = 1.0  # weak prior of every landmark, in units of its depth: keeps the system determined
-_ROBUST_KERNEL = 2.0
-
-
-@dataclass(frozen=True, slots=True)
-class DepthMeasurements:
-    """Prior values of a keyframe: track ids, inverse depths, standard deviations, first guess of the affine.
-
-    `free_shift` is False where the prior knows its zero (depth, metric depth).
-    """
-
-    ids: Index
-    inverse_depth: Array
-    sigma: Array
-    affine: tuple[float, float]
-    free_shift: bool = True
-
-
-@dataclass(frozen=True, slots=True)
-class Keyframe:
-    """What enters the graph with a keyframe.
-
-    Attributes:
-        position: identity of the keyframe.
-        rotation, translation: `cam_from_world`, first guess.
-        ids, xy: tracks that are landmarks, and their undistorted normalised observations.
-        depth: prior at some of them.
-    """
-
-    position: int
-    rotation: Array
-    translation: Array
-    ids: Index
-    xy: Array
-    depth: DepthMeasurements | None = None
+_LARGEST_ERROR_PX = 10.0
+_LEAST_IN_FRONT = 0.7
 
 
 @dataclass(frozen=True, slots=True)
 class UpdateResult:
-    """Outcome of an update: committed or rolled back, and why."""
+    """Outcome of an update: committed or rolled back, and why.
+
+    Attributes:
+        covariance: (6, 6) of the pose of each free keyframe, by position (`FrameResult.covariance`).
+    """
 
     committed: bool
     reason: str
+    covariance: dict[int, Array]
 
 
 class FactorGraph:
-    """Poses X(position), landmarks L(track), prior affines A(position) in one iSAM2.
+    """Poses X(position) and affines A(position) of the keyframes.
 
-    Every update runs on a copy and is committed only if the result is finite, in front of the cameras and not mirrored;
-    a failed iSAM2 object is never used again.
+    Every update runs on a copy and is committed only if the result is finite, in front of the cameras and not
+    mirrored; a failed iSAM2 object is never used again.
     """
 
-    def __init__(self, focal: float, pixel_sigma: float) -> None:
+    def __init__(self) -> None:
         parameters = gtsam.ISAM2Params()
-        parameters.setRelinearizeThreshold(0.003)
+        parameters.setRelinearizeThreshold(0.0)
         parameters.relinearizeSkip = 1
         parameters.findUnusedFactorSlots = True
         self._isam = gtsam.ISAM2(parameters)
-        self._calibration = gtsam.Cal3_S2(focal, focal, 0.0, 0.0, 0.0)
-        self._focal = focal
-        robust = gtsam.noiseModel.mEstimator.Cauchy.Create(_ROBUST_KERNEL)
-        self._pixel_noise = gtsam.noiseModel.Robust.Create(robust, gtsam.noiseModel.Isotropic.Sigma(2, pixel_sigma))
-        self._robust = robust
-        self._estimate = gtsam.Values()
-        self.landmarks: Index = np.zeros(0, np.int64)
-        self.keyframes: list[int] = []
-        self._has_offset = False
+        self._slots: list[int] = []  # of the landmarks' factor
 
     def update(
         self,
-        keyframe: Keyframe,
-        new_ids: Index,
-        new_points: Array,
-        earlier: list[tuple[int, Index, Array]],
+        adjustment: BundleAdjustment,
+        positions: Sequence[int],
+        held: Sequence[bool],
+        guided: Sequence[int],
+        iterations: int,
     ) -> UpdateResult:
-        """Add a keyframe and new landmarks.
+        """Solve for the keyframes of a window and their landmarks; `adjustment.state` is the result if it commits.
 
         Args:
-            new_ids, new_points: landmarks that the graph does not know yet, with their first position.
-            earlier: observations of the new landmarks in earlier keyframes: (position, ids, normalised xy).
+            adjustment: the problem of the window.
+            positions, held: identity of each of its frames, and which of them are constant.
+            guided: positions of the frames that carry a depth prior, in the order of their affines.
+            iterations: steps at most.
         """
-        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        pose = pose_from_camera(keyframe.rotation, keyframe.translation)
-        values.insert(X(keyframe.position), pose)
-        if not self.keyframes:
-            graph.add(gtsam.PriorFactorPose3(X(keyframe.position), pose, gtsam.noiseModel.Isotropic.Sigma(6, 1e-5)))
-        distance = np.linalg.norm(new_points, axis=1)
-        for track, point, length in zip(new_ids.tolist(), new_points, distance.tolist(), strict=True):
-            values.insert(L(track), point)
-            noise = gtsam.noiseModel.Isotropic.Sigma(3, _LANDMARK_SIGMA * max(length, 1e-3))
-            graph.add(gtsam.PriorFactorPoint3(L(track), point, noise))
-        for position, ids, xy in [*earlier, (keyframe.position, keyframe.ids, keyframe.xy)]:
-            for track, pixel in zip(ids.tolist(), xy * self._focal, strict=True):
-                graph.add(
-                    gtsam.GenericProjectionFactorCal3_S2(
-                        pixel, self._pixel_noise, X(position), L(track), self._calibration
+        free = [(row, p) for row, (p, constant) in enumerate(zip(positions, held, strict=True)) if not constant]
+        trial = _Trial(gtsam.ISAM2(self._isam), self._slots, free, guided)
+        before = adjustment.state
+        try:
+            adjustment.solve(iterations, trial.step)
+            covariance = {p: np.asarray(trial.isam.marginalCovariance(X(p))) for _, p in free}
+        except Exception as error:  # gtsam raises several types; any of them leaves the trial unusable
+            reason = f"the linear system of the update is indeterminate ({str(error).strip().splitlines()[0]})"
+        else:
+            reason = _fault(adjustment)
+        if reason:
+            logger.warning("update at frame %d rolled back: %s", positions[-1], reason)
+            adjustment.state = before
+            return UpdateResult(False, reason, {})
+        self._isam, self._slots = trial.isam, trial.slots
+        return UpdateResult(True, "committed", covariance)
+
+
+class _Trial:
+    """A copy of iSAM2 that takes the steps of one update."""
+
+    def __init__(self, isam: gtsam.ISAM2, slots: list[int], free: list[tuple[int, int]], guided: Sequence[int]) -> None:
+        self.isam, self.slots = isam, slots
+        self._rows = [row for row, _ in free]
+        self._poses = [X(p) for _, p in free]
+        self._affines = [A(p) for p in guided]
+        self.keys = [*self._poses, *self._affines, *([F(0)] if guided else [])]
+
+    def step(self, state: State, information: Array, gradient: Array) -> Array:
+        """The cameras' step from `state`: the condensed landmarks replace those of the step before."""
+        point = self._values(state)
+        graph = gtsam.NonlinearFactorGraph()
+        graph.add(gtsam.LinearContainerFactor(self._condensed(information, gradient), point))
+        known = self.isam.getLinearizationPoint()
+        new = gtsam.Values(point)
+        for key in self.keys:
+            if known.exists(key):
+                new.erase(key)
+        result = self.isam.update(graph, new, self.slots)
+        self.slots = [int(result.getNewFactorsIndices()[0])]
+        estimate = self.isam.calculateEstimate()
+        poses = [point.atPose3(key).localCoordinates(estimate.atPose3(key)) for key in self._poses]
+        vectors = [estimate.atVector(key) - point.atVector(key) for key in self.keys[len(self._poses) :]]
+        return np.concatenate([*poses, *vectors])
+
+    def _values(self, state: State) -> gtsam.Values:
+        values = gtsam.Values()
+        for key, row in zip(self._poses, self._rows, strict=True):
+            values.insert(key, pose_from_camera(state.rotation[row], state.translation[row]))
+        for key, scale, shift in zip(self._affines, state.scale, state.shift, strict=True):
+            values.insert(key, np.array([scale, shift]))
+        if self._affines:
+            values.insert(F(0), state.field)
+        return values
+
+    def _condensed(self, information: Array, gradient: Array) -> gtsam.HessianFactor:
+        """A quadratic on all variables at once; the binding builds it from its pairs."""
+        size = len(gradient) - 6 * len(self._poses) - 2 * len(self._affines)
+        sizes = [6] * len(self._poses) + [2] * len(self._affines) + [size] * bool(self._affines)
+        ends = np.cumsum(sizes)
+        spans = [slice(end - n, end) for end, n in zip(ends.tolist(), sizes, strict=True)]
+        pairs = gtsam.GaussianFactorGraph()
+        for i, (key, a) in enumerate(zip(self.keys, spans, strict=True)):
+            pairs.add(gtsam.HessianFactor(key, information[a, a], -gradient[a], 0.0))
+            none = np.zeros((sizes[i], sizes[i]))
+            for other, b, n in zip(self.keys[i + 1 :], spans[i + 1 :], sizes[i + 1 :], strict=True):
+                pairs.add(
+                    gtsam.HessianFactor(
+                        key, other, none, information[a, b], np.zeros(sizes[i]), np.zeros((n, n)), np.zeros(n), 0.0
                     )
                 )
-        if keyframe.depth is not None:
-            self._add_depth(graph, values, keyframe.position, keyframe.depth)
-        return self._commit(graph, values, keyframe, new_ids)
+        return gtsam.HessianFactor(pairs)
 
-    def _add_depth(
-        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, position: int, depth: DepthMeasurements
-    ) -> None:
-        if not self._has_offset:
-            values.insert(T(0), virtual_offset())
-            graph.add(gtsam.PriorFactorPose3(T(0), virtual_offset(), gtsam.noiseModel.Isotropic.Sigma(6, 1e-8)))
-        scale, shift = depth.affine
-        values.insert(A(position), native_affine(scale, shift))
-        shift_sigma = SHIFT_SIGMA if depth.free_shift else KNOWN_SHIFT_SIGMA
-        center = float(np.median(depth.inverse_depth))
-        graph.add(
-            gtsam.PriorFactorCal3_S2(
-                A(position),
-                native_affine(scale, 0.0),
-                native_affine_noise(SCALE_SIGMA * scale, shift_sigma * center),
-            )
-        )
-        for track, value, sigma in zip(
-            depth.ids.tolist(), depth.inverse_depth.tolist(), depth.sigma.tolist(), strict=True
-        ):
-            noise = gtsam.noiseModel.Robust.Create(
-                self._robust, gtsam.noiseModel.Diagonal.Sigmas(np.array([sigma, 1e6]))
-            )
-            graph.add(native_depth_factor(X(position), T(0), L(track), A(position), value, noise))
 
-    def _commit(
-        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, keyframe: Keyframe, new_ids: Index
-    ) -> UpdateResult:
-        trial = gtsam.ISAM2(self._isam)
-        try:
-            trial.update(graph, values)
-            trial.update()  # a second relinearisation: translations are millimetres, the first step is long
-            estimate = trial.calculateEstimate()
-        except Exception as error:  # gtsam raises several types; any of them leaves the trial unusable
-            logger.warning("update at frame %d rolled back: %s", keyframe.position, str(error).strip().split("\n")[0])
-            return UpdateResult(False, "the linear system of the update is indeterminate")
-        reason = self._fault(estimate, keyframe)
-        if reason:
-            logger.warning("update at frame %d rolled back: %s", keyframe.position, reason)
-            return UpdateResult(False, reason)
-        self._isam, self._estimate = trial, estimate
-        self.landmarks = np.union1d(self.landmarks, new_ids)
-        self.keyframes.append(keyframe.position)
-        self._has_offset |= keyframe.depth is not None
-        return UpdateResult(True, "committed")
-
-    def _fault(self, estimate: gtsam.Values, keyframe: Keyframe) -> str:
-        """What speaks against a result; empty if nothing does."""
-        rotation, translation = camera_from_pose(estimate.atPose3(X(keyframe.position)))
-        if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
-            return "the pose is not finite"
-        if not len(keyframe.ids):
-            return "the keyframe observes no landmark"
-        points = np.array([estimate.atPoint3(L(track)) for track in keyframe.ids.tolist()]).reshape(-1, 3)
-        q = points @ rotation.T + translation
-        front = q[:, 2] > 1e-6
-        if front.mean() < 0.7:
-            return f"{int((~front).sum())} of {len(front)} landmarks lie behind the camera"
-        error = np.linalg.norm(q[front, :2] / q[front, 2:] - keyframe.xy[front], axis=1) * self._focal
-        if np.median(error) > 10.0:
-            return f"the median reprojection error is {np.median(error):.1f} pixels, at most 10 expected"
-        if keyframe.depth is not None and affine_of_native(estimate.atCal3_S2(A(keyframe.position)))[0] <= 0.0:
-            return "the depth is mirrored: the prior's scale is negative"
-        return ""
-
-    def poses(self) -> dict[int, tuple[Array, Array]]:
-        """`cam_from_world` of every keyframe."""
-        return {k: camera_from_pose(self._estimate.atPose3(X(k))) for k in self.keyframes}
-
-    def points(self) -> tuple[Index, Array]:
-        """Track ids (ascending) and positions (n, 3) of the landmarks."""
-        return self.landmarks, np.asarray(gtsam.utilities.extractPoint3(self._estimate)).reshape(-1, 3)
-
-    def affine(self, position: int) -> tuple[float, float] | None:
-        """Scale and shift of a keyframe's prior, None where it has none."""
-        if not self._estimate.exists(A(position)):
-            return None
-        return affine_of_native(self._estimate.atCal3_S2(A(position)))
+def _fault(adjustment: BundleAdjustment) -> str:
+    """What speaks against a result, judged at its newest frame; empty if nothing does."""
+    state, o = adjustment.state, adjustment.observations
+    newest = len(state.rotation) - 1
+    if not (np.isfinite(state.rotation).all() and np.isfinite(state.translation).all()):
+        return "the pose is not finite"
+    mine = o.frame == newest
+    if not mine.any():
+        return "the keyframe observes no landmark"
+    depth = state.camera_points(o.frame[mine], o.point[mine])[:, 2]
+    front = depth > 1e-6
+    if front.mean() < _LEAST_IN_FRONT:
+        return f"{int((~front).sum())} of {len(front)} landmarks lie behind the camera"
+    error = float(np.median(adjustment.reprojection_errors()[mine]))
+    if not error < _LARGEST_ERROR_PX:
+        return f"the median reprojection error is {error:.1f} pixels, at most {_LARGEST_ERROR_PX:.0f} expected"
+    if (state.scale <= 0.0).any():
+        return "the depth is mirrored: the scale of a prior is negative"
+    return ""

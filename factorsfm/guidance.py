@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.graph import DepthMeasurements
 from factorsfm.images import MappedImage, gather
 from factorsfm.options import MapperOptions
 from factorsfm.point_map import PointMap
@@ -50,10 +49,8 @@ class DepthGuidance:
             image.affine = fit_affine(inverse, measured, free_shift=depth.free_shift)[:2]
 
     def sigma(self, image: MappedImage, keyframes: int) -> float:
-        """Standard deviation of the prior in the live graph.
-
-        The robust spread of its residuals, inflated by the number of keyframes that repeat the same error; the polish
-        measures it properly (`prior_weight`).
+        """Standard deviation of the prior at a point: the robust spread of its residuals, inflated by the number of
+        keyframes that repeat the same error.
         """
         depth = image.tracks.depth
         assert depth is not None
@@ -65,18 +62,6 @@ class DepthGuidance:
             residual = scale * self.points.inverse_depths(image, use) + shift - depth.inverse_depth[use]
             spread = 1.4826 * float(np.median(np.abs(residual)))
         return max(spread, _SMALLEST_SPREAD) * float(np.sqrt(1.0 + keyframes))
-
-    def measurements(self, image: MappedImage, used: NDArray[np.bool_], keyframes: int) -> DepthMeasurements | None:
-        """The prior at landmarks of a new keyframe, for the graph."""
-        depth = image.tracks.depth
-        if not self.options.graph_depth or depth is None or image.affine is None:
-            return None
-        use = used & depth.valid
-        n = int(use.sum())
-        if n < _LEAST_POINTS:
-            return None
-        sigma = np.full(n, self.sigma(image, keyframes))
-        return DepthMeasurements(image.tracks.ids[use], depth.inverse_depth[use], sigma, image.affine, depth.free_shift)
 
     def fallback(self, image: MappedImage, ids: Index) -> Array:
         """(n,) inverse distances where the views leave them open: from the image's prior, else the map's median."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +39,6 @@ class MappedImage:
 
     Attributes:
         affine: scale and shift of its depth prior beside the map.
-        outliers: of a keyframe, tracks whose point the updated map puts elsewhere.
     """
 
     tracks: ImageTracks
@@ -50,7 +49,6 @@ class MappedImage:
     keyframe: bool = False
     inliers: int = 0
     affine: tuple[float, float] | None = None
-    outliers: Index = field(default_factory=lambda: np.zeros(0, np.int64))
 
     @property
     def registered(self) -> bool:

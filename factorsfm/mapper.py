@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.graph import FactorGraph, Keyframe
-from factorsfm.guidance import DepthGuidance
-from factorsfm.images import ImageTracks, MappedImage, gather, median_flow
+from factorsfm.graph import FactorGraph
+from factorsfm.images import ImageTracks, MappedImage, median_flow
 from factorsfm.initialization import NoStart, Start, start_essential, start_lifted, start_pair
+from factorsfm.map_update import MapCopy, MapUpdate, update_map
 from factorsfm.options import Options
 from factorsfm.point_map import PointMap
 from factorsfm.reconstruction import FrameStatus
 from factorsfm.registration import ImageDepth, Registration, register_image
-from factorsfm.triangulation import triangulate
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -26,6 +26,8 @@ logger = logging.getLogger(__name__)
 
 _PAIR_WINDOW = 10  # images among which the paper's initial pair is sought
 _LIFT_PATIENCE = 10  # images without a usable depth map after which the start does without
+_DEPTH_PATIENCE = 3  # keyframes without a depth map after which one does without
+_LEAST_SHARED = 0.7  # of the tracks of the last keyframe; with fewer, a new one is made
 
 
 class Mapper:
@@ -42,7 +44,12 @@ class Mapper:
         self.focal = focal
         self.width = width
         self.images: list[MappedImage] = []
-        self.graph = FactorGraph(focal, self.options.pixel_sigma)
+        self.keyframes: list[int] = []
+        self.outliers = np.zeros(0, np.int64)  # tracks that the last image showed to be wrong
+        self.graph = FactorGraph()
+        self._worker = ThreadPoolExecutor(1, "factorsfm-graph")
+        self._update: Future[MapUpdate] | None = None
+        self._due = 0
         self._start_kind = self.options.initialization if has_prior else "essential"
         self._reads_every_depth = has_prior and (
             self._start_kind == "pair" or self.options.registration_depth != "none"
@@ -50,7 +57,6 @@ class Mapper:
         self._uses_keyframe_depth = has_prior and options.uses_depth
         self._started = False
         self.points = PointMap()
-        self.guidance = DepthGuidance(self.options, self.points)
         self._waits_for_depth = 0
 
     # --- the algorithm ------------------------------------------------------------------------------------------
@@ -63,6 +69,9 @@ class Mapper:
         """
         if self._reads_every_depth:
             tracks = replace(tracks, depth=read_depth())
+        self.outliers = np.zeros(0, np.int64)
+        if self._update is not None and len(self.images) >= self._due:
+            self._take_over()
         image = MappedImage(tracks, FrameStatus.WAITING, "waiting for the start of the map")
         self.images.append(image)
         try:
@@ -80,17 +89,29 @@ class Mapper:
             self._try_start(image, read_depth)
         else:
             self._register(image)
-            if image.registered and self._is_keyframe(image):
+            if image.registered and self._update is None and self._is_keyframe(image):
                 self._add_keyframe(image, read_depth)
 
     def finish(self) -> None:
-        """No more images: start with what there is, if nothing better came."""
+        """No more images: start with what there is, if nothing better came; all images on the map as it is at last."""
         if not self._started and self._start_kind == "pair":
             self._begin(self._start_from_pair())
         if not self._started:
             self._begin(self._start_essential(angle_deg=0.0))
         if not self._started:
             self._begin(self._start_flat())
+        self.refresh()
+        self._worker.shutdown()
+
+    def refresh(self) -> None:
+        """Register the images between the keyframes once more, on the map as it is now."""
+        self._take_over()
+        for image in self.images:
+            if image.registered and not image.keyframe:
+                known = image.status, image.message
+                self._register(image)
+                if image.status is not FrameStatus.REGISTERED:
+                    image.status, image.message = known
 
     # --- start --------------------------------------------------------------------------------------------------
 
@@ -155,6 +176,7 @@ class Mapper:
             image = next(i for i in waiting if i.tracks.position == position)
             self._accept(image, Registration(rotation, translation, np.isin(image.tracks.ids, start.ids), 0.0, 0.0))
             self._add_keyframe(image, None)
+            self._take_over()
         # Next image as COLMAP chooses it: the one that sees most of the map.
         remaining = [image for image in waiting if not image.registered]
         while remaining:
@@ -163,6 +185,7 @@ class Mapper:
             self._register(image)
             if image.registered and self._is_keyframe(image):
                 self._add_keyframe(image, None)
+                self._take_over()
 
     # --- registration -------------------------------------------------------------------------------------------
 
@@ -175,7 +198,7 @@ class Mapper:
             image.status = FrameStatus.TOO_FEW_TRACKS
             image.message = f"{mapped.sum()} of {o.min_inliers} needed tracks have a point in the map"
             return
-        near = self._nearest_registered(tracks.position)
+        near = image if image.registered else self._nearest_registered(tracks.position)
         depth = None
         if o.registration_depth != "none" and tracks.depth is not None:
             depth = _select(tracks.depth, mapped)
@@ -217,107 +240,64 @@ class Mapper:
     # --- keyframes and landmarks --------------------------------------------------------------------------------
 
     def _is_keyframe(self, image: MappedImage) -> bool:
-        last = self.images[self.graph.keyframes[-1]].tracks if self.graph.keyframes else None
-        if last is None:
-            return True
+        o, count = self.options, len(self.keyframes)
+        last = self.images[self.keyframes[-1]].tracks
         shared = np.isin(image.tracks.ids, last.ids, assume_unique=True).sum()
-        return (
-            abs(image.tracks.position - last.position) >= self.options.keyframe_interval
-            or shared < 0.7 * len(last.ids)
-            or median_flow(image.tracks, last) * self.focal > self.options.keyframe_flow * self.width
+        # A young map has the shape that the prior guessed: the first keyframes come soon.
+        youth = min(1.0, 0.25 * count)
+        return bool(
+            shared < _LEAST_SHARED * len(last.ids)
+            or median_flow(image.tracks, last) * self.focal > youth * o.keyframe_flow * self.width
+            or image.tracks.position - last.position >= o.keyframe_interval * max(1, count // 10)
         )
 
     def _add_keyframe(self, image: MappedImage, read_depth: Callable[[], ImageDepth | None] | None) -> None:
-        """Depth of the keyframe, new landmarks, update of the graph, and the map as the graph now sees it."""
-        if self._uses_keyframe_depth and image.tracks.depth is None and read_depth is not None:
-            image.tracks = replace(image.tracks, depth=read_depth())
-            if image.tracks.depth is None and self._waits_for_depth < 3:
-                self._waits_for_depth += 1  # the next image may have a map
-                return
-            self._waits_for_depth = 0
-        tracks = image.tracks
-        self.guidance.fit(image)
-        known = np.isin(tracks.ids, self.graph.landmarks, assume_unique=True) & self._explained(image)
-        new_ids, new_points = self._new_landmarks(image, known)
-        used = known | np.isin(tracks.ids, new_ids, assume_unique=True)
-        if used.sum() < self.options.min_inliers:
-            return
-        keyframe = Keyframe(
-            tracks.position,
-            *image.pose,
-            tracks.ids[used],
-            tracks.xy[used],
-            self.guidance.measurements(image, used, len(self.graph.keyframes)),
-        )
-        earlier = []
-        for position in self.graph.keyframes:
-            before = self.images[position].tracks
-            seen = np.isin(before.ids, new_ids, assume_unique=True)
-            if seen.any():
-                earlier.append((position, before.ids[seen], before.xy[seen]))
-        result = self.graph.update(keyframe, new_ids, new_points, earlier)
-        if not result.committed:
-            return
+        """Let the graph work on the keyframe; the map takes over its result after `graph_delay` frames."""
+        keyframes = [replace(self.images[k]) for k in self.keyframes] + [replace(image)]
+        copy = MapCopy(keyframes, self.points.copy(), self.options, self.focal)
+        read = read_depth if self._uses_keyframe_depth else None
+        self._update = self._worker.submit(update_map, copy, self.graph, read)
         image.keyframe = True
-        self.points.set(*self.graph.points())
-        for position, (rotation, translation) in self.graph.poses().items():
-            self.images[position].rotation, self.images[position].translation = rotation, translation
-        image.affine = self.graph.affine(tracks.position) or image.affine
-        # Only what is grossly wrong: a young map is, too, and long tracks are precious.
-        gross = self.points.contains(tracks.ids) & ~self._explained(image, leniency=4.0)
-        image.outliers = tracks.ids[gross]
+        self._due = len(self.images) - 1 + self.options.graph_delay
 
-    def _explained(self, image: MappedImage, leniency: float = 1.0) -> NDArray[np.bool_]:
-        """Which tracks have a point that projects where it was seen, within the widened inlier threshold."""
-        mapped = self.points.contains(image.tracks.ids)
-        error = self.points.reprojection_errors(image, mapped) * self.focal
-        limit = max(self.options.inlier_px, 5.0 * float(np.median(error)) if len(error) else 0.0)
-        explained = mapped.copy()
-        explained[mapped] = error < leniency * limit
-        return explained
+    def _take_over(self) -> None:
+        """Wait for the graph, and take over the map as it sees it now."""
+        if self._update is None:
+            return
+        pending, self._update = self._update, None
+        update = pending.result()
+        image = self.images[update.position]
+        if image.tracks.depth is None and update.depth is not None:
+            image.tracks = replace(image.tracks, depth=update.depth)
+        if self._uses_keyframe_depth and update.depth is None and self._waits_for_depth < _DEPTH_PATIENCE:
+            self._waits_for_depth += 1  # another image may have a map
+            image.keyframe = False
+            return
+        self._waits_for_depth = 0
+        if not update.committed:
+            image.keyframe = False
+            return
+        self.keyframes.append(update.position)
+        before = image.pose
+        self.points.set(update.ids, update.points)
+        self.points.remove(update.removed)
+        for position, pose in update.poses.items():
+            self.images[position].rotation, self.images[position].translation = pose
+        for position, affine in update.affines.items():
+            self.images[position].affine = affine
+        self.outliers = update.outliers
+        self._carry(update.position, before)
 
-    def _new_landmarks(self, image: MappedImage, known: NDArray[np.bool_]) -> tuple[Index, Array]:
-        """Tracks that become landmarks: well spread, triangulated from the keyframes that see them."""
-        o = self.options
-        room = o.landmarks - int(known.sum())
-        candidates = ~np.isin(image.tracks.ids, self.graph.landmarks, assume_unique=True)
-        keyframes = [self.images[k] for k in self.graph.keyframes] + [image]
-        if len(keyframes) == 1:  # the start: its points are there already
-            candidates &= self.points.contains(image.tracks.ids)
-        else:
-            seen = np.concatenate([k.tracks.ids for k in keyframes[:-1]])
-            candidates &= np.isin(image.tracks.ids, seen)
-        if room < o.landmarks // 10 or not candidates.any():
-            return np.zeros(0, np.int64), np.zeros((0, 3))
-        chosen = _spread(image.tracks.xy, known, np.nonzero(candidates)[0], room)
-        ids = np.sort(image.tracks.ids[chosen])
-        if len(keyframes) == 1:
-            return ids, self.points.at(ids)
-        return self._triangulate(keyframes, ids)
-
-    def _triangulate(self, keyframes: list[MappedImage], ids: Index) -> tuple[Index, Array]:
-        o = self.options
-        rotation = np.array([k.rotation for k in keyframes])
-        translation = np.array([k.translation for k in keyframes])
-        affine, prior = self.guidance.at_observations(keyframes, ids)
-        result = triangulate(
-            rotation, translation, gather(keyframes, ids), focal=self.focal, inlier_px=o.inlier_px, sigma=o.pixel_sigma,
-            fallback=self.guidance.fallback(keyframes[-1], ids), affine=affine, prior=prior,
-        )  # fmt: skip
-        good = (result.inliers >= 2) & (result.inverse_distance > 1e-6)
-        return ids[good], result.bearing[good] / result.inverse_distance[good, None]
+    def _carry(self, position: int, before: tuple[Array, Array]) -> None:
+        """Move the images after a keyframe with it: they were registered on the map as it was before."""
+        rotation, translation = self.images[position].pose
+        for image in self.images[position + 1 :]:
+            if image.registered:
+                turn, shift = image.pose
+                relative = turn @ before[0].T
+                image.rotation = relative @ rotation
+                image.translation = relative @ (translation - before[1]) + shift
 
 
 def _select(depth: ImageDepth, index: NDArray[np.bool_]) -> ImageDepth:
     return replace(depth, inverse_depth=depth.inverse_depth[index], reliability=depth.reliability[index])
-
-
-def _spread(xy: Array, taken: NDArray[np.bool_], candidates: NDArray[np.intp], count: int) -> NDArray[np.intp]:
-    """`count` of the candidates, taken in turn from the emptiest cells of a grid; older tracks come first."""
-    cell = np.floor((xy - xy.min(0)) / np.maximum(np.ptp(xy, axis=0), 1e-9) * [15.99, 8.99]).astype(int)
-    key = cell[:, 0] * 9 + cell[:, 1]
-    load = np.bincount(key[taken], minlength=144)
-    order = candidates[np.argsort(key[candidates], kind="stable")]
-    first = np.searchsorted(key[order], np.arange(144))
-    rank = np.arange(len(order)) - first[key[order]] + load[key[order]]
-    return np.asarray(order[np.argsort(rank, kind="stable")[:count]])

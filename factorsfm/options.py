@@ -53,7 +53,10 @@ class MapperOptions:
         inlier_px: largest reprojection error of an inlier at registration, widened where the map is still rough.
         keyframe_flow: median flow since the last keyframe that makes a new one (share of the image width).
         keyframe_interval: frames after which a keyframe is made at the latest.
-        landmarks: landmarks alive in the graph per keyframe.
+        landmarks: landmarks of the graph that a keyframe sees.
+        graph_iterations: steps of the graph at a keyframe.
+        graph_delay: frames after a keyframe at which the map takes over what the graph made of it; until then the
+            graph works beside the registration.
         pixel_sigma: standard deviation of a tracked point in the graph (pixels).
         essential_angle_deg: median triangulation angle that a start without depth waits for.
     """
@@ -68,7 +71,9 @@ class MapperOptions:
     inlier_px: float = 3.0
     keyframe_flow: float = 0.02
     keyframe_interval: int = 12
-    landmarks: int = 250
+    landmarks: int = 600
+    graph_iterations: int = 3
+    graph_delay: int = 3
     pixel_sigma: float = 0.25
     essential_angle_deg: float = 1.0
 
@@ -87,6 +92,9 @@ class PolishOptions:
         point_sigma: weak prior of every inverse distance around its start, in units of the scene's median.
         max_frames: frames that are variables; in a longer shot the others are registered on the polished points.
         outlier_sigmas: tracks beyond this many robust standard deviations of all tracks are removed.
+        observation_sigmas: single observations with larger errors than this many standard deviations are removed
+            instead; None removes whole tracks only.
+        doubtful_px: standard deviation of the errors above which a solution is doubted and other starts are tried.
     """
 
     depth: bool = True
@@ -97,6 +105,8 @@ class PolishOptions:
     min_track_length: int = 5
     point_sigma: float = 1.0
     outlier_sigmas: float = 3.0
+    observation_sigmas: float | None = None
+    doubtful_px: float = 0.2
     max_frames: int = 400
 
 

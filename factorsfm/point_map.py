@@ -36,6 +36,16 @@ class PointMap:
             self._points = np.concatenate([self._points, np.full_like(self._points, np.nan)])
         self._points[ids] = points
 
+    def remove(self, ids: Index) -> None:
+        """Forget the positions of some tracks."""
+        self._points[ids] = np.nan
+
+    def copy(self) -> PointMap:
+        """An independent copy."""
+        other = PointMap()
+        other._points = self._points.copy()
+        return other
+
     def all(self) -> tuple[Index, Array]:
         """Track ids (ascending) and positions of all points."""
         ids = np.nonzero(np.isfinite(self._points[:, 0]))[0]

@@ -10,7 +10,14 @@ from numpy.typing import NDArray
 
 from factorsfm.images import MappedImage
 from factorsfm.options import PolishOptions
-from factorsfm.prior_weight import PriorWeight, direction_angles, field_grid, measure_weight, sample_points
+from factorsfm.prior_weight import (
+    PriorWeight,
+    direction_angles,
+    field_grid,
+    measure_weight,
+    sample_points,
+    usual_weight,
+)
 from factorsfm.problem import Observations, PriorObservations, State
 from factorsfm.refinement import BundleAdjustment
 from factorsfm.registration import KNOWN_SHIFT_SIGMA, SCALE_SIGMA, SHIFT_SIGMA, fit_affine
@@ -85,6 +92,18 @@ def weigh_prior(
     return WeighedPrior(weight, values.rows, scale, shift, inflation)
 
 
+def usual_prior(
+    state: State, observations: Observations, tracks: Index, images: list[MappedImage]
+) -> WeighedPrior | None:
+    """The prior as networks usually are, where the shot has not shown yet how good this one is."""
+    values = _prior_values(images, observations, tracks)
+    if values is None:
+        return None
+    affines = [images[row].affine or (1.0, 0.0) for row in values.rows]
+    scale, shift = np.array(affines).T
+    return WeighedPrior(usual_weight(direction_angles(state.bearing)), values.rows, scale, shift, 1.0)
+
+
 def joint_problem(
     state: State,
     observations: Observations,
@@ -93,8 +112,9 @@ def joint_problem(
     weighed: WeighedPrior,
     sigma: float,
     options: PolishOptions,
+    fixed: NDArray[np.bool_] | None = None,
 ) -> tuple[BundleAdjustment, PriorPart]:
-    """The final problem: all tracks, and the prior at its weight."""
+    """Tracks and the prior at its weight; `fixed` as in `BundleAdjustment`."""
     values = _prior_values(images, observations, tracks)
     assert values is not None
     point = observations.point[values.at]
@@ -107,7 +127,7 @@ def joint_problem(
         SHIFT_SIGMA if values.free_shift else KNOWN_SHIFT_SIGMA,
     )  # fmt: skip
     state = replace(state, scale=weighed.scale, shift=weighed.shift, field=np.zeros(len(information)))
-    joint = BundleAdjustment(state, observations, options, sigma=sigma, prior=prior)
+    joint = BundleAdjustment(state, observations, options, sigma=sigma, fixed=fixed, prior=prior)
     none = np.zeros(0)
     return joint, PriorPart(weighed.weight, values.rows, prior, none, none, none)
 

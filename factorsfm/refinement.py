@@ -8,6 +8,7 @@ distance, in which small motion is almost linear.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,9 @@ from factorsfm.problem import Observations, PriorObservations, State
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+
+# The camera side's step at a state, from its information matrix and gradient with the points eliminated.
+CameraSolver = Callable[[State, Array, Array], Array]
 
 _CHUNK = 512  # points eliminated together
 _FIRST_DAMPING = 1e-4
@@ -53,6 +57,10 @@ class _Normal:
     terms: list[_Term]
 
 
+def _newton_step(state: State, information: Array, gradient: Array) -> Array:
+    return np.asarray(-np.linalg.solve(information, gradient))
+
+
 class BundleAdjustment:
     """Levenberg-Marquardt over poses, points, focal length, prior affines and the prior's smooth error field.
 
@@ -62,6 +70,7 @@ class BundleAdjustment:
         free_translation: False estimates rotations and bearings alone.
         free_focal: whether the focal length is estimated.
         points_only: True holds everything but the points fixed.
+        fixed: (k,) frames whose poses are held; by default the first, which is the world.
         prior: depth-prior values, or None.
     """
 
@@ -75,6 +84,7 @@ class BundleAdjustment:
         free_translation: bool = True,
         free_focal: bool = False,
         points_only: bool = False,
+        fixed: NDArray[np.bool_] | None = None,
         prior: PriorObservations | None = None,
     ) -> None:
         if (np.diff(observations.point) < 0).any():
@@ -93,7 +103,8 @@ class BundleAdjustment:
         self._field = self._affine + 2 * images
         self._columns = self._field + nodes
         free = np.ones(self._columns, bool)
-        free[:6] = False  # the first camera is the world
+        held = np.arange(frames) == 0 if fixed is None else fixed
+        free[: self._lens] = np.repeat(~held, 6)
         free[self._lens] = free_focal
         if not free_translation:
             free[: self._lens].reshape(-1, 6)[:, 3:] = False
@@ -314,11 +325,13 @@ class BundleAdjustment:
             gradient[columns] -= cross @ step.ravel()
         return information, gradient, point_covariance
 
-    def _step(self, normal: _Normal, blocks: list[tuple[Array, Index, slice]], damping: float) -> tuple[Array, Array]:
+    def _step(
+        self, normal: _Normal, blocks: list[tuple[Array, Index, slice]], damping: float, solve_cameras: CameraSolver
+    ) -> tuple[Array, Array]:
         information, gradient, point_covariance = self._reduced(normal, blocks, damping)
         free = self._free
         camera = np.zeros(self._columns)
-        camera[free] = -np.linalg.solve(_conditioned(information[np.ix_(free, free)]), gradient[free])
+        camera[free] = solve_cameras(self.state, _conditioned(information[np.ix_(free, free)]), gradient[free])
         point = np.empty((len(self.state.bearing), 3))
         for cross, columns, span in blocks:
             pull = normal.point_gradient[span] + (camera[columns] @ cross).reshape(-1, 3)
@@ -343,15 +356,20 @@ class BundleAdjustment:
             field=s.field + camera[self._field :],
         )
 
-    def solve(self, iterations: int | None = None) -> State:
-        """Minimise; the result is also `self.state`."""
+    def solve(self, iterations: int | None = None, solve_cameras: CameraSolver = _newton_step) -> State:
+        """Minimise; the result is also `self.state`.
+
+        Args:
+            iterations: at most; those of the options by default.
+            solve_cameras: see `CameraSolver`.
+        """
         damping = _FIRST_DAMPING
         cost = self.cost()
         for _ in range(iterations or self.options.iterations):
             normal = self._linearize()
             blocks = self._cross_blocks(normal)
             while damping < _LARGEST_DAMPING:
-                candidate = self._retract(*self._step(normal, blocks, damping))
+                candidate = self._retract(*self._step(normal, blocks, damping, solve_cameras))
                 new_cost = self._cost(candidate)
                 if new_cost < cost:
                     break

@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.factors import (
+    by_pose,
     camera_from_pose,
     camera_points,
+    cauchy,
     image_depth_factor,
     image_reprojection_factor,
     pose_from_camera,
@@ -24,6 +26,8 @@ Array = NDArray[np.float64]
 _POSE = gtsam.symbol("x", 0)
 _AFFINE = gtsam.symbol("a", 0)
 _KERNEL = 2.0  # Cauchy scale in standard deviations
+_ALIGN_STEPS = 20  # at most
+_BEHIND = 1e3  # residual of a point behind the camera, standard deviations
 _DEPTH_FLOOR = 0.03  # smallest believable relative error of a depth network
 
 
@@ -155,6 +159,40 @@ def _optimize(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.
     return gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
 
 
+def _align(
+    points: Array, observed: Array, rotation: Array, translation: Array, focal: float, sigma: float
+) -> tuple[Array, Array]:
+    """Minimum of `image_reprojection_factor` over the pose, in numpy: it is asked for several times a frame."""
+    one = np.ones(len(points))
+    damping, best = 1e-6, np.inf
+    normal, gradient = np.eye(6), np.zeros(6)
+    candidate = rotation, translation
+    for _ in range(_ALIGN_STEPS):
+        q = camera_points(*candidate, points, one)
+        front = q[:, 2] > 1e-6
+        q[~front, 2] = 1.0
+        residual, by_q = reprojection(q, focal * observed, focal)
+        residual, by_q = residual / sigma, by_q / sigma
+        residual[~front], by_q[~front] = _BEHIND, 0.0
+        costs, weight = cauchy(residual, _KERNEL)
+        cost = float(costs.sum())
+        if cost < best:
+            settled = best - cost < 1e-6 * cost
+            rotation, translation = candidate
+            best, damping = cost, damping / 10.0
+            if settled:
+                break
+            jacobian = by_pose(by_q.transpose(1, 0, 2), q, one).reshape(-1, 6)
+            weighted = jacobian * np.tile(weight, 2)[:, None]
+            normal, gradient = weighted.T @ jacobian, weighted.T @ residual.T.ravel()
+        else:
+            damping = max(10.0 * damping, 1e-4)
+        step = -np.linalg.solve(normal + damping * np.diag(normal.diagonal() + 1e-12), gradient)
+        turn = cv2.Rodrigues(-step[:3])[0]
+        candidate = turn @ rotation, turn @ (translation - step[3:])
+    return rotation, translation
+
+
 def _refine(
     points: Array,
     observed: Array,
@@ -168,10 +206,7 @@ def _refine(
     error = _residuals(points, observed, rotation, translation, focal)
     for _ in range(2):
         spread = min(max(sigma, _typical(error)), 100.0 * sigma)
-        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        graph.add(image_reprojection_factor(_POSE, points, observed, focal, spread, _KERNEL))
-        values.insert(_POSE, pose_from_camera(rotation, translation))
-        rotation, translation = camera_from_pose(_optimize(graph, values).atPose3(_POSE))
+        rotation, translation = _align(points, observed, rotation, translation, focal, spread)
         error = _residuals(points, observed, rotation, translation, focal)
     threshold = max(inlier_px, min(4.0 * _typical(error), 8.0 * inlier_px))
     inliers = error < threshold

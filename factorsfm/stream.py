@@ -130,10 +130,20 @@ class Stream:
             image = mapper.add(tracks, lambda: self._read_depth(frame, pixels))
         self.frames.append(SeenFrame(frame.index, frame.name, frame.timestamp, tracked.texture))
         self._pixels.append(pixels)
-        self._tracker.drop(image.outliers)
+        self._tracker.drop(mapper.outliers)
         if image.status is not FrameStatus.WAITING:  # it may still take part in the start
             _mark_blank(image, tracked.texture)
         return _update(frame.index, image)
+
+    def trajectory(self) -> list[pycolmap.Rigid3d | None]:
+        """`cam_from_world` of every frame so far as the graph knows it now, None where a frame is not registered.
+
+        The map takes over what the graph is working on, and the frames between keyframes are registered on it again.
+        """
+        if self._mapper is None:
+            return []
+        self._mapper.refresh()
+        return [_pose(image) for image in self._mapper.images]
 
     def finish(self, progress: Callable[[str, int, int | None], None] | None = None) -> Reconstruction:
         """Polish over all frames and tracks.

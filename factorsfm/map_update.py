@@ -1,0 +1,210 @@
+"""What a new keyframe does to the map: its depth, new points, and the graph solved for all that it concerns.
+
+An update works on copies and touches nothing but the graph, so that it can run beside the registration of the frames
+that follow; the mapper takes its result over when it is due.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorsfm.graph import FactorGraph, UpdateResult
+from factorsfm.guidance import DepthGuidance
+from factorsfm.images import MappedImage, gather
+from factorsfm.options import MapperOptions, PolishOptions
+from factorsfm.point_map import PointMap
+from factorsfm.prior_term import joint_problem, usual_prior
+from factorsfm.problem import Observations, State
+from factorsfm.refinement import BundleAdjustment
+from factorsfm.registration import ImageDepth
+from factorsfm.triangulation import triangulate
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+_FREE_KEYFRAMES = 20  # that an update solves for; those before are constant
+_HELD_KEYFRAMES = 8  # constant ones that take part, with what they saw
+_LEAST_SHARED = 30  # landmarks by which a constant keyframe takes part
+_GROSS = 4.0  # times the threshold of an inlier: a young map is wrong, too, and long tracks are precious
+_SOLVER = replace(PolishOptions(), tolerance=1e-3)
+_RAYLEIGH_MEDIAN = 1.1774
+_LARGEST_SIGMA_PX = 3.0
+_FARTHEST = 1e-6  # smallest inverse distance of a point
+
+
+@dataclass(frozen=True, slots=True)
+class MapUpdate:
+    """Result of an update.
+
+    Attributes:
+        position: of the new keyframe; depth: its prior.
+        committed, reason: whether the map may take it over, and why not.
+        ids, points: moved and new points; removed: points that no longer hold.
+        poses, affines, covariances: of the keyframes that moved, by position.
+        outliers: tracks of the new keyframe whose point is elsewhere.
+    """
+
+    position: int
+    depth: ImageDepth | None
+    committed: bool
+    reason: str
+    ids: Index = field(default_factory=lambda: np.zeros(0, np.int64))
+    points: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    removed: Index = field(default_factory=lambda: np.zeros(0, np.int64))
+    poses: dict[int, tuple[Array, Array]] = field(default_factory=dict)
+    affines: dict[int, tuple[float, float]] = field(default_factory=dict)
+    covariances: dict[int, Array] = field(default_factory=dict)
+    outliers: Index = field(default_factory=lambda: np.zeros(0, np.int64))
+
+
+@dataclass(frozen=True, slots=True)
+class MapCopy:
+    """What an update starts from: copies that nobody else changes.
+
+    Attributes:
+        keyframes: in order of time, the new one last.
+        focal: pixels.
+    """
+
+    keyframes: list[MappedImage]
+    points: PointMap
+    options: MapperOptions
+    focal: float
+
+
+def update_map(copy: MapCopy, graph: FactorGraph, read_depth: Callable[[], ImageDepth | None] | None) -> MapUpdate:
+    """Depth of the new keyframe, new landmarks, and what the graph makes of all keyframes around."""
+    o, newest = copy.options, copy.keyframes[-1]
+    position = newest.tracks.position
+    if newest.tracks.depth is None and read_depth is not None:
+        newest.tracks = replace(newest.tracks, depth=read_depth())
+    depth = newest.tracks.depth
+    guidance = DepthGuidance(o, copy.points)
+    guidance.fit(newest)
+    affine = {position: newest.affine} if newest.affine is not None else {}
+    if len(copy.keyframes) == 1:
+        return MapUpdate(position, depth, True, "the first keyframe", affines=affine)
+    window, held = _window(copy.keyframes)
+    _add_landmarks(copy, window, guidance)
+    ids = _landmarks(window, copy.points)
+    if (seen := int(np.isin(newest.tracks.ids, ids).sum())) < o.min_inliers:
+        return MapUpdate(position, depth, False, f"{seen} of {o.min_inliers} needed landmarks in the keyframe")
+    observations = gather(window, ids)
+    adjustment, rows = _problem(copy, window, held, ids, observations)
+    positions = [image.tracks.position for image in window]
+    guided = [positions[row] for row in rows]
+    result = graph.update(adjustment, positions, held.tolist(), guided, o.graph_iterations)
+    if not result.committed:
+        return MapUpdate(position, depth, False, result.reason)
+    return _judged(copy, adjustment, window, held, ids, guided, result)
+
+
+def _window(keyframes: list[MappedImage]) -> tuple[list[MappedImage], NDArray[np.bool_]]:
+    """The keyframes that take part, in order of time, and which of them are constant."""
+    free = keyframes[-_FREE_KEYFRAMES:]
+    before = keyframes[: -len(free)]
+    newest = keyframes[-1].tracks.ids
+    shared = np.array([np.isin(image.tracks.ids, newest, assume_unique=True).sum() for image in before], np.int64)
+    chosen = np.sort(np.argsort(-shared, kind="stable")[:_HELD_KEYFRAMES])
+    window = [before[k] for k in chosen if shared[k] >= _LEAST_SHARED] + free
+    held = np.arange(len(window)) < len(window) - len(free)
+    # Two constant cameras keep place and size; at the start the first one is the world.
+    held[: 2 if before else 1] = True
+    return window, held
+
+
+def _landmarks(window: Sequence[MappedImage], points: PointMap) -> Index:
+    """Mapped tracks that two keyframes of the window see."""
+    ids, count = np.unique(np.concatenate([image.tracks.ids for image in window]), return_counts=True)
+    ids = ids[count >= 2]
+    return ids[points.contains(ids)]
+
+
+def _add_landmarks(copy: MapCopy, window: list[MappedImage], guidance: DepthGuidance) -> None:
+    """Tracks of the new keyframe that become landmarks: well spread, triangulated from the keyframes that see them."""
+    o, newest = copy.options, window[-1]
+    known = copy.points.contains(newest.tracks.ids)
+    seen = np.concatenate([image.tracks.ids for image in window[:-1]])
+    candidates = ~known & np.isin(newest.tracks.ids, seen)
+    room = o.landmarks - int(known.sum())
+    if room < o.landmarks // 10 or not candidates.any():
+        return
+    chosen = _spread(newest.tracks.xy, known, np.nonzero(candidates)[0], room)
+    ids = np.sort(newest.tracks.ids[chosen])
+    affine, prior = guidance.at_observations(window, ids)
+    result = triangulate(
+        np.array([image.rotation for image in window]),
+        np.array([image.translation for image in window]),
+        gather(window, ids),
+        focal=copy.focal, inlier_px=o.inlier_px, sigma=o.pixel_sigma,
+        fallback=guidance.fallback(newest, ids), affine=affine, prior=prior,
+    )  # fmt: skip
+    good = (result.inliers >= 2) & (result.inverse_distance > _FARTHEST)
+    copy.points.set(ids[good], result.bearing[good] / result.inverse_distance[good, None])
+
+
+def _problem(
+    copy: MapCopy, window: list[MappedImage], held: NDArray[np.bool_], ids: Index, observations: Observations
+) -> tuple[BundleAdjustment, list[int]]:
+    """The window's problem at the noise that its residuals show, and the rows of its frames with a prior."""
+    points = copy.points.at(ids)
+    distance = np.linalg.norm(points, axis=1)
+    state = State(
+        np.array([image.rotation for image in window]),
+        np.array([image.translation for image in window]),
+        points / distance[:, None],
+        1.0 / distance,
+        float(np.log(copy.focal)),
+    )
+    unit = BundleAdjustment(state, observations, _SOLVER, sigma=1.0, fixed=held)
+    typical = float(np.median(unit.reprojection_errors())) / _RAYLEIGH_MEDIAN
+    sigma = min(max(copy.options.pixel_sigma, typical), _LARGEST_SIGMA_PX)
+    weighed = usual_prior(state, observations, ids, window) if copy.options.graph_depth else None
+    if weighed is None:
+        return BundleAdjustment(state, observations, _SOLVER, sigma=sigma, fixed=held), []
+    adjustment, part = joint_problem(state, observations, ids, window, weighed, sigma, _SOLVER, held)
+    return adjustment, part.images.tolist()
+
+
+def _judged(
+    copy: MapCopy,
+    adjustment: BundleAdjustment,
+    window: list[MappedImage],
+    held: NDArray[np.bool_],
+    ids: Index,
+    guided: list[int],
+    result: UpdateResult,
+) -> MapUpdate:
+    """The solution as the map takes it over, and what in it does not fit."""
+    state, o = adjustment.state, adjustment.observations
+    poses = {
+        image.tracks.position: (state.rotation[row], state.translation[row])
+        for row, image in enumerate(window)
+        if not held[row]
+    }
+    affines = dict(zip(guided, zip(state.scale.tolist(), state.shift.tolist(), strict=True), strict=True))
+    errors = adjustment.reprojection_errors()
+    limit = _GROSS * max(copy.options.inlier_px, 5.0 * float(np.median(errors)))
+    start = np.searchsorted(o.point, np.arange(len(ids)))
+    typical = np.sqrt(np.add.reduceat(errors**2, start) / np.diff(np.append(start, len(errors))))
+    good = (state.inverse_distance > _FARTHEST) & (typical < limit)
+    newest = (o.frame == len(window) - 1) & (errors > limit)
+    return MapUpdate(
+        window[-1].tracks.position, window[-1].tracks.depth, True, result.reason,
+        ids[good], state.points[good], ids[~good], poses, affines, result.covariance, ids[o.point[newest]],
+    )  # fmt: skip
+
+
+def _spread(xy: Array, taken: NDArray[np.bool_], candidates: NDArray[np.intp], count: int) -> NDArray[np.intp]:
+    """`count` of the candidates, taken in turn from the emptiest cells of a grid; older tracks come first."""
+    cell = np.floor((xy - xy.min(0)) / np.maximum(np.ptp(xy, axis=0), 1e-9) * [15.99, 8.99]).astype(int)
+    key = cell[:, 0] * 9 + cell[:, 1]
+    load = np.bincount(key[taken], minlength=144)
+    order = candidates[np.argsort(key[candidates], kind="stable")]
+    first = np.searchsorted(key[order], np.arange(144))
+    rank = np.arange(len(order)) - first[key[order]] + load[key[order]]
+    return np.asarray(order[np.argsort(rank, kind="stable")[:count]])
