@@ -14,6 +14,7 @@ from typing import Any, NoReturn, TextIO
 from factorsfm import api, demo
 from factorsfm.camera import read_camera
 from factorsfm.errors import FactorsfmError, ReconstructionError
+from factorsfm.export import command as export_command
 from factorsfm.export.folder import check_directory, write_failure, write_folder
 from factorsfm.frames import parse_range
 from factorsfm.options import PRESETS
@@ -37,6 +38,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         with _Progress(sys.stderr, enabled=sys.stderr.isatty() and not arguments.verbose) as progress:
             if arguments.command == "demo":
                 _demo(arguments, progress)
+            elif arguments.command == "export":
+                print(export_command.run(arguments))
             else:
                 _reconstruct(arguments, progress)
     except ReconstructionError as error:
@@ -202,4 +205,12 @@ def _parser() -> argparse.ArgumentParser:
         metavar="DIR",
         help="folder of the result (default: %(default)s)",
     )
+
+    export_parser = commands.add_parser(
+        "export",
+        parents=[common],
+        help="write a result for another tool: Nuke, Blender, USD and others",
+        description="Write a result for another tool.",
+    )
+    export_command.add_arguments(export_parser)
     return parser

@@ -1,7 +1,8 @@
-"""The sparse model as COLMAP's text files, which pycolmap, Gaussian-splat trainers and others read."""
+"""The sparse model as COLMAP's text or binary files, which pycolmap, Gaussian-splat trainers and others read."""
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Iterable
 from pathlib import Path, PurePath
 from typing import NamedTuple
@@ -56,6 +57,15 @@ def write_colmap(reconstruction: Reconstruction, folder: str | Path) -> None:
         for image_id, image in model.images.items():
             image.name = names[image_id]
         model.write_binary(folder)
+
+
+def write_colmap_binary(reconstruction: Reconstruction, folder: str | Path) -> None:
+    """Write ``cameras.bin``, ``images.bin``, ``points3D.bin`` and what else COLMAP keeps; content as `write_colmap`."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as text:
+        write_colmap(reconstruction, text)
+        pycolmap.Reconstruction(text).write_binary(folder)
 
 
 def _observations(reconstruction: Reconstruction) -> _Observations:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
-from factorsfm.reconstruction import Reconstruction
+import numpy as np
+
+from factorsfm.export.shot import Shot
+from factorsfm.reconstruction import FrameResult, Reconstruction
 
 
 def write_trajectory(reconstruction: Reconstruction, path: str | Path) -> None:
@@ -13,10 +17,41 @@ def write_trajectory(reconstruction: Reconstruction, path: str | Path) -> None:
     One line per registered frame: ``frame_index tx ty tz qx qy qz qw``; camera-to-world, OpenCV axes
     (x right, y down, z forward), world units.
     """
+    frames = reconstruction.registered
+    _write_tum(path, [str(frame.index) for frame in frames], frames)
+
+
+def write_tum(shot: Shot, path: Path) -> None:
+    """The TUM format: ``seconds tx ty tz qx qy qz qw``, camera-to-world, OpenCV camera axes.
+
+    The time is the frame's own in the source where it is known and no frame rate was asked for, else the frame's index
+    over the frame rate. A frame that is not registered has no line.
+    """
+    frames = shot.reconstruction.registered
+    timed = shot.options.fps is None and all(frame.timestamp is not None for frame in frames)
+    times = [frame.timestamp if timed else frame.index / shot.fps for frame in frames]
+    _write_tum(path, [f"{time:.9f}" for time in times], frames)
+
+
+def write_kitti(shot: Shot, path: Path) -> None:
+    """The KITTI odometry format: one line per frame, the first three rows of camera-to-world; OpenCV camera axes.
+
+    The line tells the frame, so a frame that is not registered has a line, too: twelve times ``nan``.
+    """
+    rows = np.full((len(shot.reconstruction.frames), 12), np.nan)
+    rows[[frame.registered for frame in shot.reconstruction.frames]] = shot.world_from_opencv[:, :3].reshape(-1, 12)
+    _write_lines(path, (" ".join(f"{value:.12g}" for value in row) for row in rows))
+
+
+def _write_tum(path: str | Path, stamps: Iterable[str], frames: Iterable[FrameResult]) -> None:
     lines = []
-    for frame in reconstruction.frames:
-        if frame.cam_from_world is not None:
-            world_from_cam = frame.cam_from_world.inverse()
-            values = (*world_from_cam.translation, *world_from_cam.rotation.quat)
-            lines.append(" ".join([str(frame.index), *(f"{value:.12g}" for value in values)]) + "\n")
-    Path(path).write_text("".join(lines), encoding="utf-8")
+    for stamp, frame in zip(stamps, frames, strict=True):
+        assert frame.cam_from_world is not None
+        world_from_cam = frame.cam_from_world.inverse()
+        values = (*world_from_cam.translation, *world_from_cam.rotation.quat)
+        lines.append(" ".join([stamp, *(f"{value:.12g}" for value in values)]))
+    _write_lines(path, lines)
+
+
+def _write_lines(path: str | Path, lines: Iterable[str]) -> None:
+    Path(path).write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")

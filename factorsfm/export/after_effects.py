@@ -1,0 +1,65 @@
+"""After Effects: keyframes as text, to be pasted onto a camera and onto the footage's layer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from factorsfm.export.rotation import angles_zyx
+from factorsfm.export.shot import Shot
+
+CAMERA, FOOTAGE = "camera.txt", "footage.txt"
+
+
+def write_after_effects(shot: Shot, folder: Path) -> None:
+    """Write ``camera.txt`` and ``footage.txt``, After Effects' keyframe data.
+
+    Copy the text of each and paste it, at the start of a composition of the footage's size with square pixels: the
+    first one onto a one-node camera, the second one onto the footage's layer (2-D). Positions count in pixels from the
+    top left corner, y down, z into the picture, the origin of the world in the middle of the composition; orientation
+    in degrees (first z, then y, then x). The optical axis of After Effects goes through the middle of the composition:
+    where the lens's does not, or where its focal lengths differ, the second text moves and stretches the footage.
+    Distortion is not included; frames that are not registered have no key.
+    """
+    lens = shot.lens
+    middle = np.array([lens.width / 2, lens.height / 2, 0.0])
+    positions = shot.world_from_opencv[:, :3, 3] + middle
+    orientations = angles_zyx(shot.world_from_opencv[:, :3, :3])
+    frames = shot.numbers
+    camera = [
+        _track("Transform\tPosition", "X pixels\tY pixels\tZ pixels", frames, positions),
+        _track("Transform\tOrientation", "X degrees\tY degrees\tZ degrees", frames, orientations),
+        _track("Camera Options\tZoom", "pixels", frames, np.full((len(frames), 1), lens.fx)),
+    ]
+    once = [shot.first]
+    footage = [
+        _track("Transform\tAnchor Point", "X pixels\tY pixels\tZ pixels", once, np.array([[lens.cx, lens.cy, 0.0]])),
+        _track("Transform\tPosition", "X pixels\tY pixels\tZ pixels", once, middle[None]),
+        _track(
+            "Transform\tScale", "X percent\tY percent\tZ percent", once, np.array([[100, 100 / lens.pixel_aspect, 100]])
+        ),
+    ]
+    for name, tracks in ((CAMERA, camera), (FOOTAGE, footage)):
+        # A folder's text files are pasted by hand: lines end as After Effects itself ends them.
+        (folder / name).write_text(_keyframe_data(shot, tracks), encoding="ascii", newline="\r\n")
+
+
+def _keyframe_data(shot: Shot, tracks: list[str]) -> str:
+    header = [
+        "Adobe After Effects 8.0 Keyframe Data",
+        "",
+        f"\tUnits Per Second\t{shot.fps:.12g}",
+        f"\tSource Width\t{shot.lens.width}",
+        f"\tSource Height\t{shot.lens.height}",
+        "\tSource Pixel Aspect Ratio\t1",
+        "\tComp Pixel Aspect Ratio\t1",
+    ]
+    return "\n".join(header) + "\n\n" + "\n\n".join(tracks) + "\n\n\nEnd of Keyframe Data\n"
+
+
+def _track(name: str, units: str, frames: list[int], values: np.ndarray) -> str:
+    lines = [name, f"\tFrame\t{units}\t"]
+    for frame, row in zip(frames, values, strict=True):
+        lines.append("\t".join(["", str(frame), *(f"{value:.12g}" for value in row), ""]))
+    return "\n".join(lines)

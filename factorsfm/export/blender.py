@@ -1,0 +1,143 @@
+"""A Python script that builds the scene in Blender: animated camera, points, footage behind the camera."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from factorsfm.export.footage import Sequence, background
+from factorsfm.export.shot import Shot
+
+_BUILD = """
+import bpy
+
+scene = bpy.context.scene
+scene.render.resolution_x, scene.render.resolution_y = DATA["size"]
+scene.render.resolution_percentage = 100
+scene.render.pixel_aspect_x, scene.render.pixel_aspect_y = DATA["pixel_aspect"]
+scene.render.fps, scene.render.fps_base = DATA["fps"]
+scene.frame_start, scene.frame_end = DATA["range"]
+
+collection = bpy.data.collections.new("factorsfm")
+scene.collection.children.link(collection)
+
+lens = bpy.data.cameras.new("factorsfm camera")
+lens.sensor_fit = "HORIZONTAL"
+lens.sensor_width, lens.sensor_height = DATA["sensor"]
+lens.lens = DATA["focal_length"]
+lens.shift_x, lens.shift_y = DATA["shift"]
+lens.clip_start, lens.clip_end = DATA["clip"]
+camera = bpy.data.objects.new("factorsfm camera", lens)
+collection.objects.link(camera)
+scene.camera = camera
+camera.rotation_mode = "QUATERNION"
+camera["not_registered"] = DATA["lost"]
+
+preferences = bpy.context.preferences.edit
+interpolation = preferences.keyframe_new_interpolation_type
+preferences.keyframe_new_interpolation_type = "LINEAR"
+for frame, location, rotation in zip(DATA["frames"], DATA["locations"], DATA["rotations"]):
+    camera.location = location
+    camera.rotation_quaternion = rotation
+    camera.keyframe_insert("location", frame=frame)
+    camera.keyframe_insert("rotation_quaternion", frame=frame)
+preferences.keyframe_new_interpolation_type = interpolation
+
+mesh = bpy.data.meshes.new("factorsfm points")
+mesh.from_pydata(DATA["points"], [], [])
+if DATA["points"]:
+    colors = mesh.attributes.new("color", "BYTE_COLOR", "POINT")
+    colors.data.foreach_set("color_srgb" if hasattr(colors.data[0], "color_srgb") else "color", DATA["colors"])
+collection.objects.link(bpy.data.objects.new("factorsfm points", mesh))
+
+footage = DATA["footage"]
+if footage:
+    image = bpy.data.images.load(footage["file"])
+    image.source = footage["source"]
+    behind = lens.background_images.new()
+    behind.image = image
+    behind.image_user.frame_start = footage["frame_start"]
+    behind.image_user.frame_duration = footage["frame_duration"]
+    behind.image_user.frame_offset = footage["frame_offset"]
+    behind.image_user.use_auto_refresh = True
+    behind.alpha = 1.0
+    behind.display_depth = "BACK"
+    behind.frame_method = "STRETCH"
+    lens.show_background_images = True
+
+scene.frame_set(DATA["range"][0])
+"""
+
+
+def write_blender(shot: Shot, path: Path) -> None:
+    """Write a script for Blender 3.2 or newer: run it there, or ``blender --python camera.py``.
+
+    It adds a collection to the open scene and sets the scene's size, pixel aspect, frame rate and range. Frames that
+    are not registered have no key (Blender interpolates); the camera's custom property ``not_registered`` lists them.
+    Blender's camera does not distort: put undistorted plates behind it.
+
+    Raises:
+        InputError: the footage is a folder of images that are no numbered sequence.
+    """
+    text = json.dumps(_data(shot), allow_nan=False)
+    title = '"""Builds the animated camera, the points and the footage of a factorsfm reconstruction in Blender."""'
+    path.write_text(f"{title}\n\nimport json\n\nDATA = json.loads({text!r})\n{_BUILD}", encoding="utf-8")
+
+
+def _data(shot: Shot) -> dict[str, Any]:
+    lens = shot.lens
+    fps = round(shot.fps)
+    # One of the two is 1 in Blender, the other one is at least 1.
+    pixel_aspect = max(lens.pixel_aspect, 1.0), max(1 / lens.pixel_aspect, 1.0)
+    return {
+        "size": (lens.width, lens.height),
+        "pixel_aspect": pixel_aspect,
+        "fps": (fps, fps / shot.fps),
+        "range": (shot.first, shot.last),
+        "sensor": (lens.sensor_width, lens.sensor_height),
+        "focal_length": lens.focal_length,
+        "shift": (lens.right / lens.sensor_width, lens.up / lens.sensor_width),
+        "clip": shot.clipping,
+        "frames": shot.numbers,
+        "lost": shot.lost,
+        "locations": shot.world_from_film[:, :3, 3].tolist(),
+        "rotations": _quaternions(shot),
+        "points": shot.reconstruction.points.tolist(),
+        "colors": np.pad(shot.reconstruction.colors / 255, ((0, 0), (0, 1)), constant_values=1).ravel().tolist(),
+        "footage": _footage(shot),
+    }
+
+
+def _quaternions(shot: Shot) -> list[list[float]]:
+    """Order w, x, y, z; the signs such that neighbours are close, since Blender interpolates each number."""
+    found: list[list[float]] = []
+    for matrix in shot.world_from_film:
+        x, y, z, w = pycolmap.Rotation3d(matrix[:3, :3]).quat
+        quaternion = np.array([w, x, y, z])
+        if found and np.dot(found[-1], quaternion) < 0:
+            quaternion = -quaternion
+        found.append(quaternion.tolist())
+    return found
+
+
+def _footage(shot: Shot) -> dict[str, Any] | None:
+    footage = background(shot)
+    if footage is None:
+        return None
+    if isinstance(footage, Sequence):
+        file, source, offset = footage.file(footage.first), "SEQUENCE", footage.first - 1
+        duration = footage.last - footage.first + 1
+    else:
+        file, source, offset = footage, "MOVIE", 0
+        duration = shot.reconstruction.frames[-1].index + 1
+    return {
+        "file": str(file),
+        "source": source,
+        "frame_start": shot.first_frame,
+        "frame_duration": duration,
+        "frame_offset": offset,
+    }

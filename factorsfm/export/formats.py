@@ -1,0 +1,104 @@
+"""The formats by name, and the one call that writes any of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from factorsfm.errors import InputError
+from factorsfm.export.after_effects import write_after_effects
+from factorsfm.export.alembic import write_alembic
+from factorsfm.export.blender import write_blender
+from factorsfm.export.colmap import write_colmap, write_colmap_binary
+from factorsfm.export.nerfstudio import write_nerfstudio
+from factorsfm.export.nuke import write_chan, write_nuke
+from factorsfm.export.options import ExportOptions, UpAxis
+from factorsfm.export.ply import write_ply
+from factorsfm.export.shot import Defaults, Shot, make_shot
+from factorsfm.export.stmap import write_stmaps, write_undistorted
+from factorsfm.export.trajectory import write_kitti, write_tum
+from factorsfm.export.usd import write_usd
+from factorsfm.export.writing import complete_file, complete_folder
+from factorsfm.reconstruction import Reconstruction
+
+_AS_RECONSTRUCTED = Defaults()
+
+
+@dataclass(frozen=True, slots=True)
+class Format:
+    """One way to hand a reconstruction on.
+
+    Attributes:
+        description: in a few words.
+        write: called with the shot and a path: a new file, or an empty folder.
+        is_folder: whether the format is a folder of files.
+        defaults: what it takes where the options say nothing.
+    """
+
+    description: str
+    write: Callable[[Shot, Path], None]
+    is_folder: bool = False
+    defaults: Defaults = _AS_RECONSTRUCTED
+
+
+def _reconstruction_only(write: Callable[[Reconstruction, Path], None]) -> Callable[[Shot, Path], None]:
+    return lambda shot, path: write(shot.reconstruction, path)
+
+
+FORMATS = {
+    "colmap": Format("COLMAP model, text", _reconstruction_only(write_colmap), is_folder=True),
+    "colmap-binary": Format("COLMAP model, binary", _reconstruction_only(write_colmap_binary), is_folder=True),
+    "nerfstudio": Format(
+        "transforms.json with images and points", write_nerfstudio, is_folder=True, defaults=Defaults(UpAxis.Z)
+    ),
+    "ply": Format("points", _reconstruction_only(write_ply)),
+    "tum": Format("camera path, TUM", write_tum),
+    "kitti": Format("camera path, KITTI", write_kitti),
+    "chan": Format("camera path and field of view for Nuke", write_chan, defaults=Defaults(UpAxis.Y, first_frame=1001)),
+    "nuke": Format(
+        "Nuke script with footage, camera, points and lens",
+        write_nuke,
+        is_folder=True,
+        defaults=Defaults(UpAxis.Y, first_frame=1001),
+    ),
+    "blender": Format(
+        "Python script that builds the scene in Blender", write_blender, defaults=Defaults(UpAxis.Z, first_frame=1)
+    ),
+    "after-effects": Format(
+        "keyframes to paste onto camera and footage",
+        write_after_effects,
+        is_folder=True,
+        defaults=Defaults(UpAxis.MINUS_Y, scale=100.0, first_frame=0),
+    ),
+    "usd": Format("USD stage", write_usd, defaults=Defaults(UpAxis.Y, scale=100.0, first_frame=1001)),
+    "alembic": Format("Alembic archive", write_alembic, defaults=Defaults(UpAxis.Y, first_frame=1001)),
+    "stmap": Format("maps that undistort and distort, 32-bit EXR", write_stmaps, is_folder=True),
+    "undistorted": Format(
+        "the footage without distortion", write_undistorted, is_folder=True, defaults=Defaults(first_frame=1001)
+    ),
+}
+
+
+def export(
+    reconstruction: Reconstruction, path: str | Path, *, format: str, options: ExportOptions | None = None
+) -> None:
+    """Write a reconstruction for another tool; all of it or nothing.
+
+    Args:
+        path: the file, or for the formats that consist of several files the folder, new, empty, or holding an earlier
+            export of the same kind. An earlier file is replaced.
+        format: a name from `FORMATS`.
+
+    Raises:
+        InputError: an unknown format, a package of an extra missing, no registered frame, or the path cannot be
+            written.
+    """
+    if format not in FORMATS:
+        raise InputError(f'"{format}" is no export format; the formats are {", ".join(FORMATS)}')
+    if not reconstruction.registered:
+        raise InputError("no frame is registered; there is nothing to export")
+    chosen = FORMATS[format]
+    shot = make_shot(reconstruction, options or ExportOptions(), chosen.defaults)
+    with (complete_folder if chosen.is_folder else complete_file)(Path(path)) as place:
+        chosen.write(shot, place)

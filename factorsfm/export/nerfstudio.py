@@ -1,0 +1,103 @@
+"""nerfstudio's data folder: ``transforms.json``, the images and the points, ready for training."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from pathlib import Path, PurePath
+from typing import Any
+
+import cv2
+import numpy as np
+import pycolmap
+
+from factorsfm.errors import InputError
+from factorsfm.export.ply import write_ply
+from factorsfm.export.shot import Shot
+from factorsfm.frames import read_frames
+from factorsfm.summary import json_text
+
+logger = logging.getLogger(__name__)
+
+# Ours: nerfstudio's camera model, and its names of the parameters behind the principal point.
+_MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "SIMPLE_PINHOLE": ("OPENCV", ()),
+    "PINHOLE": ("OPENCV", ()),
+    "SIMPLE_RADIAL": ("OPENCV", ("k1",)),
+    "RADIAL": ("OPENCV", ("k1", "k2")),
+    "OPENCV": ("OPENCV", ("k1", "k2", "p1", "p2")),
+    "SIMPLE_FISHEYE": ("OPENCV_FISHEYE", ()),
+    "FISHEYE": ("OPENCV_FISHEYE", ()),
+    "SIMPLE_RADIAL_FISHEYE": ("OPENCV_FISHEYE", ("k1",)),
+    "RADIAL_FISHEYE": ("OPENCV_FISHEYE", ("k1", "k2")),
+    "OPENCV_FISHEYE": ("OPENCV_FISHEYE", ("k1", "k2", "k3", "k4")),
+}
+
+
+def write_nerfstudio(shot: Shot, folder: Path) -> None:
+    """Write ``transforms.json``, ``points.ply`` and, where the footage is at hand, ``images/``.
+
+    Camera axes x right, y up, looking along -z; the principal point counts from the image's corner; distortion is
+    included. Frames that are not registered are left out.
+
+    Raises:
+        InputError: nerfstudio does not know the lens model, or the footage lacks frames.
+    """
+    names = {frame.index: _image_name(frame.name) for frame in shot.reconstruction.registered}
+    content = {
+        **_lens(shot.reconstruction.camera),
+        "frames": [
+            {"file_path": f"images/{name}", "transform_matrix": matrix}
+            for name, matrix in zip(names.values(), shot.world_from_film, strict=True)
+        ],
+        "ply_file_path": "points.ply",
+        "applied_transform": np.column_stack([shot.world, np.zeros(3)]),
+        "applied_scale": shot.scale,
+    }
+    (folder / "transforms.json").write_text(json_text(content), encoding="utf-8")
+    write_ply(shot.reconstruction, folder / "points.ply")
+    if shot.footage is None:
+        logger.warning("there is no footage: put the frames into images/ under the names of transforms.json")
+    else:
+        _write_images(shot.footage, names, folder / "images")
+
+
+def _lens(camera: pycolmap.Camera) -> dict[str, Any]:
+    if camera.model_name not in _MODELS:
+        raise InputError(f"nerfstudio does not know the lens model {camera.model_name}; it knows {', '.join(_MODELS)}")
+    model, names = _MODELS[camera.model_name]
+    values = [float(camera.params[i]) for i in camera.extra_params_idxs()]
+    return {
+        "camera_model": model,
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": camera.focal_length_x,
+        "fl_y": camera.focal_length_y,
+        "cx": camera.principal_point_x,
+        "cy": camera.principal_point_y,
+        **dict.fromkeys(("k1", "k2", "k3", "k4") if model == "OPENCV_FISHEYE" else ("k1", "k2", "p1", "p2"), 0.0),
+        **dict(zip(names, values, strict=True)),
+    }
+
+
+def _write_images(footage: Path, names: dict[int, str], folder: Path) -> None:
+    """Image files are copied as they are, frames of a video are written without loss."""
+    folder.mkdir()
+    missing = set(names)
+    indices = sorted(names)
+    for frame in read_frames(footage, slice(indices[0], indices[-1] + 1)):
+        if frame.index not in missing:
+            continue
+        missing.remove(frame.index)
+        target = folder / names[frame.index]
+        original = footage / frame.name
+        if footage.is_dir() and original.suffix == target.suffix:
+            shutil.copyfile(original, target)
+        elif not cv2.imwrite(str(target), frame.image):
+            raise OSError(f"the image {target.name} cannot be written")
+    if missing:
+        raise InputError(f"the footage {footage} lacks frame {min(missing)}, counted from 0")
+
+
+def _image_name(name: str) -> str:
+    return name if PurePath(name).suffix else f"{name}.png"

@@ -1,0 +1,237 @@
+"""A reconstruction as the film tools see it: numbered frames, cameras that look along -z, a lens in millimetres.
+
+Film tools share one camera: x right, y up, looking along -z. The reconstruction's cameras have OpenCV axes (x right,
+y down, z forward), and the first camera is the world. An export turns the world such that the chosen axis points
+upwards in the first frame, and scales it; it does not level the horizon.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from factorsfm.export.options import ExportOptions, UpAxis
+from factorsfm.reconstruction import FrameResult, Reconstruction
+
+_TURNED_WORLD = {  # exported world from the reconstruction's
+    UpAxis.MINUS_Y: np.eye(3),
+    UpAxis.Y: np.diag([1.0, -1.0, -1.0]),
+    UpAxis.Z: np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
+}
+_FILM_CAMERA = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV's camera axes from those of film tools
+# The models that are a pinhole where all parameters besides the focal length and the principal point are 0.
+_PINHOLE_IF_ZERO = frozenset({"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"})
+_DEFAULT_FPS = 24.0
+_FRAME_RATES = (24000 / 1001, 24.0, 25.0, 30000 / 1001, 30.0, 48.0, 50.0, 60000 / 1001, 60.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Defaults:
+    """What a format takes where the options say nothing."""
+
+    up_axis: UpAxis = UpAxis.MINUS_Y
+    scale: float = 1.0
+    first_frame: int = 0
+
+
+@dataclass(frozen=True)
+class Lens:
+    """The pinhole part of the camera, with a film back of a given width.
+
+    Lengths on the film back are in mm. The height of the film back has the pixels' real aspect, so that
+    `focal_length` holds for both directions.
+
+    Attributes:
+        width, height: pixels.
+        fx, fy: focal lengths, pixels.
+        cx, cy: principal point, pixels from the top left corner of the image (not from a pixel's centre).
+        sensor_width: mm.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    sensor_width: float
+
+    @property
+    def focal_length(self) -> float:
+        return self.fx * self.sensor_width / self.width
+
+    @property
+    def sensor_height(self) -> float:
+        return self.height * self.focal_length / self.fy
+
+    @property
+    def pixel_aspect(self) -> float:
+        """Width over height of a pixel."""
+        return self.fy / self.fx
+
+    @property
+    def right(self) -> float:
+        """How far the middle of the film back lies to the right of the optical axis, mm."""
+        return (0.5 - self.cx / self.width) * self.sensor_width
+
+    @property
+    def up(self) -> float:
+        """How far the middle of the film back lies above the optical axis, mm."""
+        return (self.cy / self.height - 0.5) * self.sensor_height
+
+
+@dataclass(frozen=True)
+class Shot:
+    """What the writers of a format are given.
+
+    Attributes:
+        reconstruction: turned and scaled to the exported world; covariances and prior fits are left out.
+        fps: frames per second.
+        first_frame: number of the source's frame 0.
+        sensor_width: mm.
+        world: (3, 3) rotation, exported world from that of the reconstruction.
+        scale: exported length of one world unit.
+        up_axis: axis of the exported world that points upwards in the first frame.
+        footage: the video file or folder of images, None where there is none.
+        options: as the user gave them.
+    """
+
+    reconstruction: Reconstruction
+    fps: float
+    first_frame: int
+    sensor_width: float
+    world: NDArray[np.float64]
+    scale: float
+    up_axis: UpAxis
+    footage: Path | None
+    options: ExportOptions
+
+    @property
+    def first(self) -> int:
+        """Number of the first frame of the reconstruction, registered or not."""
+        return self.first_frame + self.reconstruction.frames[0].index
+
+    @property
+    def last(self) -> int:
+        return self.first_frame + self.reconstruction.frames[-1].index
+
+    @cached_property
+    def numbers(self) -> list[int]:
+        """Numbers of the registered frames; the others have no key in any format."""
+        return [self.first_frame + frame.index for frame in self.reconstruction.registered]
+
+    @property
+    def lost(self) -> list[int]:
+        """Numbers of the frames that are not registered."""
+        return [self.first_frame + frame.index for frame in self.reconstruction.frames if not frame.registered]
+
+    @cached_property
+    def world_from_opencv(self) -> NDArray[np.float64]:
+        """(k, 4, 4) camera to world of the registered frames; camera x right, y down, looking along +z."""
+        matrices = np.tile(np.eye(4), (len(self.numbers), 1, 1))
+        for matrix, frame in zip(matrices, self.reconstruction.registered, strict=True):
+            assert frame.cam_from_world is not None
+            matrix[:3] = frame.cam_from_world.inverse().matrix()
+        return matrices
+
+    @cached_property
+    def world_from_film(self) -> NDArray[np.float64]:
+        """(k, 4, 4) camera to world of the registered frames; camera x right, y up, looking along -z."""
+        return np.asarray(self.world_from_opencv @ _FILM_CAMERA, dtype=np.float64)
+
+    @cached_property
+    def lens(self) -> Lens:
+        camera = self.reconstruction.camera
+        return Lens(
+            width=camera.width,
+            height=camera.height,
+            fx=float(camera.focal_length_x),
+            fy=float(camera.focal_length_y),
+            cx=float(camera.principal_point_x),
+            cy=float(camera.principal_point_y),
+            sensor_width=self.sensor_width,
+        )
+
+    @property
+    def distorts(self) -> bool:
+        """Whether the lens does anything that a pinhole does not."""
+        camera = self.reconstruction.camera
+        return camera.model_name not in _PINHOLE_IF_ZERO or bool(np.any(camera.params[camera.extra_params_idxs()]))
+
+    @property
+    def linear_colors(self) -> NDArray[np.float32]:
+        """(n, 3) colours of the points from 0 to 1, in linear light as renderers count."""
+        srgb = self.reconstruction.colors / 255
+        linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+        return np.asarray(linear, dtype=np.float32)
+
+    @property
+    def clipping(self) -> tuple[float, float]:
+        """Distances between which everything in the scene lies; a 24-bit depth buffer can resolve them."""
+        return 5 * self.point_size, 1e5 * self.point_size
+
+    @property
+    def point_size(self) -> float:
+        """A size at which the points can be told apart and be seen: 1/500 of their median distance."""
+        points = self.reconstruction.points
+        if not len(points) or not self.numbers:
+            return 0.01 * self.scale
+        centers = self.world_from_opencv[:, :3, 3].mean(axis=0)
+        return float(np.median(np.linalg.norm(points - centers, axis=1))) / 500
+
+
+def make_shot(reconstruction: Reconstruction, options: ExportOptions, defaults: Defaults) -> Shot:
+    """Fill in the defaults of a format, and turn and scale the world."""
+    up_axis = UpAxis(options.up_axis) if options.up_axis is not None else defaults.up_axis
+    scale = options.scale if options.scale is not None else defaults.scale
+    world = _TURNED_WORLD[up_axis]
+    return Shot(
+        reconstruction=_in_world(reconstruction, world, scale),
+        fps=options.fps or _source_fps(reconstruction.frames) or _DEFAULT_FPS,
+        first_frame=options.first_frame if options.first_frame is not None else defaults.first_frame,
+        sensor_width=options.sensor_width,
+        world=world,
+        scale=scale,
+        up_axis=up_axis,
+        footage=Path(options.footage) if options.footage is not None else _source(reconstruction),
+        options=options,
+    )
+
+
+def _in_world(reconstruction: Reconstruction, world: NDArray[np.float64], scale: float) -> Reconstruction:
+    old_from_new = pycolmap.Rotation3d(world.T)
+    frames = [replace(frame, covariance=None, prior=None) for frame in reconstruction.frames]
+    for frame in frames:
+        pose = frame.cam_from_world
+        if pose is not None:
+            frame.cam_from_world = pycolmap.Rigid3d(pose.rotation * old_from_new, scale * pose.translation)
+    points = scale * reconstruction.points.reshape(-1, 3) @ world.T
+    return replace(reconstruction, frames=frames, points=points)
+
+
+def _source_fps(frames: list[FrameResult]) -> float | None:
+    """The frame rate that the timestamps tell, a usual one where it is meant."""
+    timed = [frame for frame in frames if frame.timestamp is not None]
+    if len(timed) < 2:
+        return None
+    first, last = timed[0], timed[-1]
+    assert first.timestamp is not None
+    assert last.timestamp is not None
+    seconds = last.timestamp - first.timestamp
+    if not seconds > 0:
+        return None
+    fps = (last.index - first.index) / seconds
+    usual = min(_FRAME_RATES, key=lambda rate: abs(rate - fps))
+    # Timestamps are often rounded to milliseconds.
+    return usual if math.isclose(usual, fps, rel_tol=max(1e-4, 1e-3 / seconds)) else fps
+
+
+def _source(reconstruction: Reconstruction) -> Path | None:
+    source = reconstruction.options.get("source")
+    return Path(source) if isinstance(source, str) and Path(source).exists() else None

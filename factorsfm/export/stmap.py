@@ -1,0 +1,114 @@
+"""The lens as a pair of images that say for each pixel where to look, and footage without distortion."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from factorsfm.camera import PIXEL_CENTER
+from factorsfm.errors import InputError
+from factorsfm.export.shot import Shot
+from factorsfm.export.vfx import require
+from factorsfm.frames import read_frames
+
+Array = NDArray[np.float64]
+
+UNDISTORT, DISTORT = "undistort.exr", "distort.exr"
+
+_NOWHERE = -1.0  # outside of every image
+_SAME = 1e-3  # pixels; two points closer than that are one
+
+
+def write_stmaps(shot: Shot, folder: Path) -> None:
+    """Write ``undistort.exr`` and ``distort.exr``: 32-bit float, red is x and green is y of the place to look at.
+
+    Places count in widths and heights of the image from its bottom left corner, to a pixel's centre: the map that
+    changes nothing holds ``(column + 0.5) / width`` and ``1 - (row + 0.5) / height``, rows counted from the top. Blue
+    is 0. `undistort.exr` makes footage straight, `distort.exr` bends a render to fit the footage. Size, focal length
+    and principal point are the same before and after, so the exported camera fits the straight footage as it is. Where
+    there is nothing to look at, both hold -1.
+
+    Raises:
+        InputError: the package that writes EXR files is missing.
+    """
+    camera = shot.reconstruction.camera
+    _write_exr(folder / UNDISTORT, _stmap(_distorted_places(camera), camera))
+    _write_exr(folder / DISTORT, _stmap(_undistorted_places(camera), camera))
+
+
+def write_undistorted(shot: Shot, folder: Path) -> None:
+    """Write every frame of the footage without distortion, as ``plate.NUMBER.png``; 8 bits per channel, cubic.
+
+    Also the frames that are not registered, and those outside of the range that was reconstructed: the plates take
+    the footage's place as it is.
+
+    Raises:
+        InputError: there is no footage, or it has another size than the camera.
+    """
+    camera = shot.reconstruction.camera
+    if shot.footage is None:
+        raise InputError("there is no footage to undistort; name a video file or a folder of images")
+    places = np.nan_to_num(_distorted_places(camera), nan=-max(camera.width, camera.height)) - PIXEL_CENTER
+    x, y = np.moveaxis(places, -1, 0).astype(np.float32)
+    for frame in read_frames(shot.footage):
+        height, width = frame.image.shape[:2]
+        if (width, height) != (camera.width, camera.height):
+            raise InputError(
+                f"the footage {shot.footage} has {width}x{height} pixels, the camera {camera.width}x{camera.height}"
+            )
+        plate = cv2.remap(frame.image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)
+        name = f"plate.{shot.first_frame + frame.index:04d}.png"
+        if not cv2.imwrite(str(folder / name), plate):
+            raise OSError(f"the image {name} cannot be written")
+
+
+def _distorted_places(camera: pycolmap.Camera) -> Array:
+    """(h, w, 2) where in the distorted image the pixels of the undistorted one are: pixels from the corner.
+
+    NaN beyond the angle up to which the lens model is one-to-one: it folds back there.
+    """
+    focal, principal = _focal_and_principal(camera)
+    rays = (_pixels(camera) - principal) / focal
+    places = np.asarray(camera.img_from_cam(np.column_stack([rays, np.ones(len(rays))])), np.float64)
+    back = np.asarray(camera.cam_from_img(places), np.float64)
+    places[~(np.abs(back - rays) * focal < _SAME).all(axis=1)] = np.nan
+    return places.reshape(camera.height, camera.width, 2)
+
+
+def _undistorted_places(camera: pycolmap.Camera) -> Array:
+    """(h, w, 2) where in the undistorted image the pixels of the distorted one are: pixels from the corner."""
+    rays = np.asarray(camera.cam_from_img(_pixels(camera)), np.float64)
+    focal, principal = _focal_and_principal(camera)
+    return (rays * focal + principal).reshape(camera.height, camera.width, 2)
+
+
+def _focal_and_principal(camera: pycolmap.Camera) -> tuple[Array, Array]:
+    """(2,) each, pixels."""
+    focal = np.array([camera.focal_length_x, camera.focal_length_y], np.float64)
+    return focal, np.array([camera.principal_point_x, camera.principal_point_y], np.float64)
+
+
+def _pixels(camera: pycolmap.Camera) -> Array:
+    """(h * w, 2) centres of all pixels, row by row."""
+    x, y = np.meshgrid(np.arange(camera.width) + PIXEL_CENTER, np.arange(camera.height) + PIXEL_CENTER)
+    return np.column_stack([x.ravel(), y.ravel()])
+
+
+def _stmap(places: Array, camera: pycolmap.Camera) -> NDArray[np.float32]:
+    """(h, w, 3) red, green, blue."""
+    x, y = places[..., 0] / camera.width, 1 - places[..., 1] / camera.height
+    outside = ~(np.isfinite(x) & np.isfinite(y))
+    image = np.stack([x, y, np.zeros_like(x)], axis=-1)
+    image[outside, :2] = _NOWHERE
+    return image.astype(np.float32)
+
+
+def _write_exr(path: Path, image: NDArray[np.float32]) -> None:
+    openexr = require("OpenEXR")
+    header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
+    with openexr.File(header, {"RGB": np.ascontiguousarray(image)}) as file:
+        file.write(str(path))

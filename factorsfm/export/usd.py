@@ -1,0 +1,65 @@
+"""USD: a stage with the animated camera and the points."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from factorsfm.errors import InputError
+from factorsfm.export.options import UpAxis
+from factorsfm.export.shot import Shot
+from factorsfm.export.vfx import require
+
+CAMERA, POINTS = "/factorsfm/camera", "/factorsfm/points"
+
+
+def write_usd(shot: Shot, path: Path) -> None:
+    """Write the stage; the path's suffix chooses text (.usda) or binary (.usdc, .usd).
+
+    By default in centimetres, a world unit counting as a metre. Apertures and focal length are in tenths of the
+    stage's unit as USD wants them, so they are millimetres in a stage in centimetres. The principal point is in the
+    aperture offsets. One sample per registered frame; USD interpolates between them, and the stage's custom data
+    ``notRegistered`` lists the frames without. Distortion is not included.
+
+    Raises:
+        InputError: usd-core is missing, the suffix is none of USD's, or the up axis is none that a stage can have.
+    """
+    gf, sdf, usd, geom, vt = (require(f"pxr.{name}") for name in ("Gf", "Sdf", "Usd", "UsdGeom", "Vt"))
+    if path.suffix not in (".usd", ".usda", ".usdc"):
+        raise InputError(f"the output {path.name} ends in none of .usd, .usda, .usdc")
+    if shot.up_axis is UpAxis.MINUS_Y:
+        raise InputError("the up axis of a USD stage is y or z, not -y")
+    meters_per_unit = 1 / shot.scale
+    lens, tenths_per_mm = shot.lens, 0.01 / meters_per_unit
+
+    layer = sdf.Layer.CreateNew(str(path), args={"format": "usda"} if path.suffix == ".usda" else {})
+    stage = usd.Stage.Open(layer)
+    geom.SetStageUpAxis(stage, shot.up_axis.upper())
+    geom.SetStageMetersPerUnit(stage, meters_per_unit)
+    stage.SetTimeCodesPerSecond(shot.fps)
+    stage.SetFramesPerSecond(shot.fps)
+    stage.SetStartTimeCode(shot.first)
+    stage.SetEndTimeCode(shot.last)
+    stage.SetMetadataByDictKey("customLayerData", "notRegistered", vt.IntArray(shot.lost))
+    stage.SetDefaultPrim(geom.Xform.Define(stage, "/factorsfm").GetPrim())
+
+    camera = geom.Camera.Define(stage, CAMERA)
+    camera.CreateHorizontalApertureAttr(tenths_per_mm * lens.sensor_width)
+    camera.CreateVerticalApertureAttr(tenths_per_mm * lens.sensor_height)
+    camera.CreateHorizontalApertureOffsetAttr(tenths_per_mm * lens.right)
+    camera.CreateVerticalApertureOffsetAttr(tenths_per_mm * lens.up)
+    camera.CreateFocalLengthAttr(tenths_per_mm * lens.focal_length)
+    camera.CreateClippingRangeAttr(gf.Vec2f(*shot.clipping))
+    transform = camera.AddTransformOp()
+    for number, matrix in zip(shot.numbers, shot.world_from_film, strict=True):
+        transform.Set(gf.Matrix4d(matrix.T.tolist()), number)
+
+    points = geom.Points.Define(stage, POINTS)
+    points.CreatePointsAttr(vt.Vec3fArray.FromNumpy(shot.reconstruction.points.astype(np.float32)))
+    points.CreateWidthsAttr(vt.FloatArray([shot.point_size]))
+    points.SetWidthsInterpolation(geom.Tokens.constant)
+    colors = points.CreateDisplayColorPrimvar(geom.Tokens.vertex)
+    colors.Set(vt.Vec3fArray.FromNumpy(shot.linear_colors))
+    points.CreateExtentAttr(geom.Points.ComputeExtent(points.GetPointsAttr().Get(), points.GetWidthsAttr().Get()))
+    stage.Save()
