@@ -569,6 +569,36 @@ def test_output_that_holds_something_else_is_left_alone(tmp_path: Path) -> None:
     assert [(p.name, p.read_text()) for p in folder.iterdir()] == [("mine.txt", "x")]
 
 
+def test_footage_must_be_a_numbered_sequence_or_is_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    footage = noise_images(tmp_path / "shot", 21)
+    (footage / "shot.1005.png").unlink()
+    with pytest.raises(InputError, match="not numbered without gaps"):
+        export(hard_reconstruction(), tmp_path / "a", format="blender", options=ExportOptions(footage=footage))
+    reconstruction = hard_reconstruction("PINHOLE", options={"source": str(footage)})
+    export(reconstruction, tmp_path / "b", format="nuke")
+    assert "not numbered without gaps" in caplog.text
+    assert nuke_nodes((tmp_path / "b" / "camera.nk").read_text())["Plate"]["class"] == "Constant"
+
+
+def test_source_is_the_footage_where_none_is_given(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    footage = tmp_path / "a [1] $x.mp4"
+    footage.write_bytes(b"not looked at")
+    export(hard_reconstruction(options={"source": str(footage)}), tmp_path / "out", format="nuke")
+    plate = nuke_nodes((tmp_path / "out" / "camera.nk").read_text())["Plate"]
+    assert plate["file"] == '"' + str(footage).replace("[", r"\[").replace("$", r"\$") + '"'
+    assert (plate["first"], plate["last"], plate["frame"]) == ("1", "21", "1001")
+    assert caplog.text == ""  # the script undistorts it
+    export(hard_reconstruction(options={"source": str(footage)}), tmp_path / "out.py", format="blender")
+    assert "the lens distorts" in caplog.text
+
+
+def test_output_can_be_the_working_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for _ in range(2):
+        export(hard_reconstruction(), ".", format="colmap")
+    assert {path.name for path in tmp_path.iterdir()} == {"cameras.txt", "images.txt", "points3D.txt"}
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -628,5 +658,6 @@ def test_frame_rate_of_the_source(tmp_path: Path, rate: float, expected: float) 
 def test_import_is_light() -> None:
     """The command line works without the extras' packages and does not wait for them."""
     code = "import sys, factorsfm.cli; print([m for m in ('pxr', 'OpenEXR', 'alembic3d') if m in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    root = Path(__file__).parents[1]
+    done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from factorsfm.export.shot import Shot
-from factorsfm.export.vfx import require
+from factorsfm.export.vfx import failures_as_os_errors, require
 
 CAMERA, POINTS = "camera", "points"
 
@@ -27,9 +27,10 @@ def write_alembic(shot: Shot, path: Path) -> None:
         times.append(number / shot.fps)
     sampling = core.TimeSampling(core.TimeSamplingType(core.AcyclicFlag.kAcyclic), times)
 
-    archive = abc.OArchive(str(path), asOgawa=True)
-    _write_camera(shot, archive, archive.addTimeSampling(sampling), geom, imath)
-    _write_points(shot, archive, geom, imath)
+    with failures_as_os_errors():
+        archive = abc.OArchive(str(path), asOgawa=True)
+        _write_camera(shot, archive, archive.addTimeSampling(sampling), geom, imath)
+        _write_points(shot, archive, geom, imath)
 
 
 def _write_camera(shot: Shot, archive: Any, sampling: int, geom: Any, imath: Any) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,8 @@ import pycolmap
 
 from factorsfm.export.footage import Sequence, background
 from factorsfm.export.shot import Shot
+
+logger = logging.getLogger(__name__)
 
 _BUILD = """
 import bpy
@@ -37,21 +40,25 @@ scene.camera = camera
 camera.rotation_mode = "QUATERNION"
 camera["not_registered"] = DATA["lost"]
 
-preferences = bpy.context.preferences.edit
-interpolation = preferences.keyframe_new_interpolation_type
-preferences.keyframe_new_interpolation_type = "LINEAR"
 for frame, location, rotation in zip(DATA["frames"], DATA["locations"], DATA["rotations"]):
     camera.location = location
     camera.rotation_quaternion = rotation
     camera.keyframe_insert("location", frame=frame)
     camera.keyframe_insert("rotation_quaternion", frame=frame)
-preferences.keyframe_new_interpolation_type = interpolation
+action = camera.animation_data.action
+if hasattr(action, "fcurves"):
+    curves = list(action.fcurves)
+else:  # since Blender 5
+    bags = [bag for layer in action.layers for strip in layer.strips for bag in strip.channelbags]
+    curves = [curve for bag in bags for curve in bag.fcurves]
+for key in [key for curve in curves for key in curve.keyframe_points]:
+    key.interpolation = "LINEAR"
 
 mesh = bpy.data.meshes.new("factorsfm points")
 mesh.from_pydata(DATA["points"], [], [])
 if DATA["points"]:
     colors = mesh.attributes.new("color", "BYTE_COLOR", "POINT")
-    colors.data.foreach_set("color_srgb" if hasattr(colors.data[0], "color_srgb") else "color", DATA["colors"])
+    colors.data.foreach_set("color_srgb", DATA["colors"])
 collection.objects.link(bpy.data.objects.new("factorsfm points", mesh))
 
 footage = DATA["footage"]
@@ -74,7 +81,7 @@ scene.frame_set(DATA["range"][0])
 
 
 def write_blender(shot: Shot, path: Path) -> None:
-    """Write a script for Blender 3.2 or newer: run it there, or ``blender --python camera.py``.
+    """Write a script for Blender 3.4 or newer: run it there, or ``blender --python camera.py``.
 
     It adds a collection to the open scene and sets the scene's size, pixel aspect, frame rate and range. Frames that
     are not registered have no key (Blender interpolates); the camera's custom property ``not_registered`` lists them.
@@ -128,6 +135,8 @@ def _footage(shot: Shot) -> dict[str, Any] | None:
     footage = background(shot)
     if footage is None:
         return None
+    if shot.distorts:
+        logger.warning("the lens distorts, Blender's camera does not: put undistorted plates behind it")
     if isinstance(footage, Sequence):
         file, source, offset = footage.file(footage.first), "SEQUENCE", footage.first - 1
         duration = footage.last - footage.first + 1

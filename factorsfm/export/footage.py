@@ -49,8 +49,6 @@ def background(shot: Shot) -> Path | Sequence | None:
     path = shot.footage
     if path is None:
         return None
-    if shot.distorts:
-        logger.warning("the lens distorts, the camera in this format does not: put undistorted plates behind it")
     if path.is_file():
         return path.absolute()
     try:

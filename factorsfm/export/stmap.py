@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from factorsfm.camera import PIXEL_CENTER
 from factorsfm.errors import InputError
 from factorsfm.export.shot import Shot
-from factorsfm.export.vfx import require
+from factorsfm.export.vfx import failures_as_os_errors, require
 from factorsfm.frames import read_frames
 
 Array = NDArray[np.float64]
@@ -110,5 +110,5 @@ def _stmap(places: Array, camera: pycolmap.Camera) -> NDArray[np.float32]:
 def _write_exr(path: Path, image: NDArray[np.float32]) -> None:
     openexr = require("OpenEXR")
     header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
-    with openexr.File(header, {"RGB": np.ascontiguousarray(image)}) as file:
+    with failures_as_os_errors(), openexr.File(header, {"RGB": np.ascontiguousarray(image)}) as file:
         file.write(str(path))

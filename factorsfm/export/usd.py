@@ -9,7 +9,7 @@ import numpy as np
 from factorsfm.errors import InputError
 from factorsfm.export.options import UpAxis
 from factorsfm.export.shot import Shot
-from factorsfm.export.vfx import require
+from factorsfm.export.vfx import failures_as_os_errors, require
 
 CAMERA, POINTS = "/factorsfm/camera", "/factorsfm/points"
 
@@ -33,7 +33,8 @@ def write_usd(shot: Shot, path: Path) -> None:
     meters_per_unit = 1 / shot.scale
     lens, tenths_per_mm = shot.lens, 0.01 / meters_per_unit
 
-    layer = sdf.Layer.CreateNew(str(path), args={"format": "usda"} if path.suffix == ".usda" else {})
+    with failures_as_os_errors():
+        layer = sdf.Layer.CreateNew(str(path), args={"format": "usda"} if path.suffix == ".usda" else {})
     stage = usd.Stage.Open(layer)
     geom.SetStageUpAxis(stage, shot.up_axis.upper())
     geom.SetStageMetersPerUnit(stage, meters_per_unit)
@@ -62,4 +63,5 @@ def write_usd(shot: Shot, path: Path) -> None:
     colors = points.CreateDisplayColorPrimvar(geom.Tokens.vertex)
     colors.Set(vt.Vec3fArray.FromNumpy(shot.linear_colors))
     points.CreateExtentAttr(geom.Points.ComputeExtent(points.GetPointsAttr().Get(), points.GetWidthsAttr().Get()))
-    stage.Save()
+    with failures_as_os_errors():
+        stage.Save()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from typing import Any
 
@@ -23,3 +25,12 @@ def require(module: str) -> Any:
         raise InputError(
             f"this format needs the package {root}: pip install 'factorsfm[{_EXTRA_OF_MODULE[root]}]'"
         ) from error
+
+
+@contextmanager
+def failures_as_os_errors() -> Iterator[None]:
+    """These packages raise a plain RuntimeError where a file cannot be written."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise OSError(str(error)) from error

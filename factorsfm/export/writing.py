@@ -34,33 +34,39 @@ def complete_folder(path: Path) -> Iterator[Path]:
     Raises:
         InputError: it cannot be written, or it holds something else.
     """
+    path = path.absolute()
     if path.exists() and not path.is_dir():
         raise InputError(f"the output {path} is a file; this format is a folder")
     with _temporary_beside(path) as temporary:
         folder = temporary / path.name  # a plain mkdir honours the umask, the temporary folder does not
         folder.mkdir()
         yield folder
-        if not path.exists():
+        if path.exists():
+            _replace_content(path, folder)
+        else:
             folder.rename(path)
-            return
-        entries = sorted(folder.rglob("*"))
-        others = {p.relative_to(path) for p in path.rglob("*")} - {p.relative_to(folder) for p in entries}
-        if others:
-            raise InputError(f"the output folder {path} holds something else ({min(others)}); choose a new folder")
-        for entry in entries:
-            target = path / entry.relative_to(folder)
-            if entry.is_dir():
-                target.mkdir(exist_ok=True)
-            else:
-                entry.replace(target)
+
+
+def _replace_content(path: Path, new: Path) -> None:
+    entries = {entry.relative_to(new): entry for entry in sorted(new.rglob("*"))}
+    present = [entry for entry in path.rglob("*") if entry not in new.parents and not entry.is_relative_to(new)]
+    others = {entry.relative_to(path) for entry in present} - set(entries)
+    if others:
+        raise InputError(f"the output folder {path} holds something else ({min(others)}); choose a new folder")
+    for name, entry in entries.items():
+        if entry.is_dir():
+            (path / name).mkdir(exist_ok=True)
+        else:
+            entry.replace(path / name)
 
 
 @contextmanager
 def _temporary_beside(path: Path) -> Iterator[Path]:
+    # Inside a folder that exists, since that may be a mount point or the working directory.
+    place = path if path.is_dir() else path.absolute().parent
     try:
-        parent = path.absolute().parent
-        parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{PROGRAM}-", dir=parent) as folder:
+        place.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{PROGRAM}-", dir=place) as folder:
             yield Path(folder)
     except OSError as error:
         raise InputError(f"cannot write the output {path}: {error.strerror or error}") from error
