@@ -33,6 +33,12 @@ def camera_points(rotation: Array, translation: Array, m: Array, w: Array) -> Ar
     return np.asarray(np.einsum("...ij,...j->...i", rotation, m) + w[..., None] * translation)
 
 
+def cross_matrix(v: Array) -> Array:
+    """(3, 3) matrix of ``v x .``."""
+    x, y, z = v
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
 def by_pose(by_q: Array, q: Array, w: Array) -> Array:
     """Chain a derivative by `q` to the pose perturbation (omega, v).
 

@@ -39,6 +39,7 @@ class MappedImage:
 
     Attributes:
         affine: scale and shift of its depth prior beside the map.
+        covariance: (6, 6) of the pose as it was registered, or as the graph has it for a keyframe.
     """
 
     tracks: ImageTracks
@@ -49,6 +50,7 @@ class MappedImage:
     keyframe: bool = False
     inliers: int = 0
     affine: tuple[float, float] | None = None
+    covariance: Array | None = None
 
     @property
     def registered(self) -> bool:

@@ -30,9 +30,11 @@ _FREE_KEYFRAMES = 20  # that an update solves for; those before are constant
 _HELD_KEYFRAMES = 8  # constant ones that take part, with what they saw
 _LEAST_SHARED = 30  # landmarks by which a constant keyframe takes part
 _GROSS = 4.0  # times the threshold of an inlier: a young map is wrong, too, and long tracks are precious
-_SOLVER = replace(PolishOptions(), tolerance=1e-3)
+_YOUNG_ITERATIONS = 40  # divided by the number of keyframes
+_SOLVER = replace(PolishOptions(), tolerance=1e-4)
 _RAYLEIGH_MEDIAN = 1.1774
 _LARGEST_SIGMA_PX = 3.0
+_ALIKE = 10.0  # tracks that count as one: the errors of neighbours are alike
 _FARTHEST = 1e-6  # smallest inverse distance of a point
 
 
@@ -97,7 +99,9 @@ def update_map(copy: MapCopy, graph: FactorGraph, read_depth: Callable[[], Image
     adjustment, rows = _problem(copy, window, held, ids, observations)
     positions = [image.tracks.position for image in window]
     guided = [positions[row] for row in rows]
-    result = graph.update(adjustment, positions, held.tolist(), guided, o.graph_iterations)
+    # A young map has the shape that the prior guessed, and far to go; it is also cheap.
+    iterations = max(o.graph_iterations, _YOUNG_ITERATIONS // len(copy.keyframes))
+    result = graph.update(adjustment, positions, held.tolist(), guided, iterations)
     if not result.committed:
         return MapUpdate(position, depth, False, result.reason)
     return _judged(copy, adjustment, window, held, ids, guided, result)
@@ -181,12 +185,15 @@ def _judged(
 ) -> MapUpdate:
     """The solution as the map takes it over, and what in it does not fit."""
     state, o = adjustment.state, adjustment.observations
+    unit = _unit(window, held, state)
     poses = {
-        image.tracks.position: (state.rotation[row], state.translation[row])
+        image.tracks.position: (state.rotation[row], unit * state.translation[row])
         for row, image in enumerate(window)
         if not held[row]
     }
-    affines = dict(zip(guided, zip(state.scale.tolist(), state.shift.tolist(), strict=True), strict=True))
+    affines = dict(zip(guided, zip((unit * state.scale).tolist(), state.shift.tolist(), strict=True), strict=True))
+    units = np.array([1.0, 1.0, 1.0, unit, unit, unit])
+    covariances = {p: _ALIKE * c * np.outer(units, units) for p, c in result.covariance.items()}
     errors = adjustment.reprojection_errors()
     limit = _GROSS * max(copy.options.inlier_px, 5.0 * float(np.median(errors)))
     start = np.searchsorted(o.point, np.arange(len(ids)))
@@ -195,8 +202,21 @@ def _judged(
     newest = (o.frame == len(window) - 1) & (errors > limit)
     return MapUpdate(
         window[-1].tracks.position, window[-1].tracks.depth, True, result.reason,
-        ids[good], state.points[good], ids[~good], poses, affines, result.covariance, ids[o.point[newest]],
+        ids[good], unit * state.points[good], ids[~good], poses, affines, covariances, ids[o.point[newest]],
     )  # fmt: skip
+
+
+def _unit(window: list[MappedImage], held: NDArray[np.bool_], state: State) -> float:
+    """Factor that keeps the length of the camera's path, so that poses already given still fit those to come.
+
+    1 where the unit is not free: two cameras are constant, or a prior that knows its zero holds it.
+    """
+    depths = [image.tracks.depth for image in window if image.tracks.depth is not None]
+    if held.sum() > 1 or any(not depth.free_shift for depth in depths):
+        return 1.0
+    before = np.array([image.pose[1] for image in window])  # the first camera is the world
+    lengths = np.linalg.norm(before, axis=1).sum(), np.linalg.norm(state.translation, axis=1).sum()
+    return float(lengths[0] / lengths[1]) if min(lengths) > 1e-9 else 1.0
 
 
 def _spread(xy: Array, taken: NDArray[np.bool_], candidates: NDArray[np.intp], count: int) -> NDArray[np.intp]:

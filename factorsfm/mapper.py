@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.factors import cross_matrix
 from factorsfm.graph import FactorGraph
 from factorsfm.images import ImageTracks, MappedImage, median_flow
 from factorsfm.initialization import NoStart, Start, start_essential, start_lifted, start_pair
@@ -27,6 +28,7 @@ logger = logging.getLogger(__name__)
 _PAIR_WINDOW = 10  # images among which the paper's initial pair is sought
 _LIFT_PATIENCE = 10  # images without a usable depth map after which the start does without
 _DEPTH_PATIENCE = 3  # keyframes without a depth map after which one does without
+_YOUNG_ERROR = 0.8  # relative, of a map that only the prior has shaped; falls with the square of the keyframes
 _LEAST_SHARED = 0.7  # of the tracks of the last keyframe; with fewer, a new one is made
 
 
@@ -46,6 +48,8 @@ class Mapper:
         self.images: list[MappedImage] = []
         self.keyframes: list[int] = []
         self.outliers = np.zeros(0, np.int64)  # tracks that the last image showed to be wrong
+        self.new_points = 0  # that came with the last image
+        self.parallax = 0.0  # largest so far
         self.graph = FactorGraph()
         self._worker = ThreadPoolExecutor(1, "factorsfm-graph")
         self._update: Future[MapUpdate] | None = None
@@ -70,6 +74,7 @@ class Mapper:
         if self._reads_every_depth:
             tracks = replace(tracks, depth=read_depth())
         self.outliers = np.zeros(0, np.int64)
+        self.new_points = 0
         if self._update is not None and len(self.images) >= self._due:
             self._take_over()
         image = MappedImage(tracks, FrameStatus.WAITING, "waiting for the start of the map")
@@ -171,10 +176,12 @@ class Mapper:
             return
         self._started = True
         self.points.set(start.ids, start.points)
+        self.new_points = len(start.ids)
         waiting = self._waiting()
         for position, rotation, translation in zip(start.images, start.rotation, start.translation, strict=True):
             image = next(i for i in waiting if i.tracks.position == position)
-            self._accept(image, Registration(rotation, translation, np.isin(image.tracks.ids, start.ids), 0.0, 0.0))
+            inliers = np.isin(image.tracks.ids, start.ids)
+            self._accept(image, Registration(rotation, translation, inliers, 0.0, 0.0, np.zeros((6, 6))))
             self._add_keyframe(image, None)
             self._take_over()
         # Next image as COLMAP chooses it: the one that sees most of the map.
@@ -236,6 +243,29 @@ class Mapper:
         image.message = f"{image.inliers} inliers within {result.threshold:.1f} pixels"
         if result.affine is not None:
             image.affine = result.affine
+        image.covariance = self._covariance(image, result.covariance)
+        inverse = self.points.inverse_depths(image, result.inliers)
+        if len(inverse):  # the first camera is the world
+            moved = float(np.linalg.norm(result.translation))
+            self.parallax = max(self.parallax, moved * float(np.median(inverse)))
+
+    def _covariance(self, image: MappedImage, on_map: Array) -> Array:
+        """Of a pose just registered: what is uncertain on an exact map, and what the map itself leaves open."""
+        rotation, translation = image.pose
+        solved = [k for k in self.keyframes if self.images[k].covariance is not None]
+        # What linearised covariances do not know of a young map: that its whole shape is still a guess.
+        bent = _YOUNG_ERROR * float(np.linalg.norm(translation)) / max(len(solved), 1) ** 2
+        on_map = on_map + bent**2 * np.eye(6)
+        if len(solved) < 2:
+            return on_map
+        keyframe = self.images[solved[-1]]
+        assert keyframe.covariance is not None
+        turn = rotation @ keyframe.pose[0].T
+        shift = translation - turn @ keyframe.pose[1]
+        adjoint = np.zeros((6, 6))
+        adjoint[:3, :3] = adjoint[3:, 3:] = turn
+        adjoint[3:, :3] = cross_matrix(shift) @ turn
+        return on_map + adjoint @ keyframe.covariance @ adjoint.T
 
     # --- keyframes and landmarks --------------------------------------------------------------------------------
 
@@ -243,12 +273,14 @@ class Mapper:
         o, count = self.options, len(self.keyframes)
         last = self.images[self.keyframes[-1]].tracks
         shared = np.isin(image.tracks.ids, last.ids, assume_unique=True).sum()
-        # A young map has the shape that the prior guessed: the first keyframes come soon.
+        # A young map has the shape that the prior guessed: the first keyframes come soon. Of a camera that hardly
+        # moves, ever fewer are needed.
         youth = min(1.0, 0.25 * count)
+        interval = min(2 * count, o.keyframe_interval) * max(1, count // 10)
         return bool(
             shared < _LEAST_SHARED * len(last.ids)
             or median_flow(image.tracks, last) * self.focal > youth * o.keyframe_flow * self.width
-            or image.tracks.position - last.position >= o.keyframe_interval * max(1, count // 10)
+            or image.tracks.position - last.position >= interval
         )
 
     def _add_keyframe(self, image: MappedImage, read_depth: Callable[[], ImageDepth | None] | None) -> None:
@@ -279,10 +311,13 @@ class Mapper:
             return
         self.keyframes.append(update.position)
         before = image.pose
+        self.new_points = int((~self.points.contains(update.ids)).sum())
         self.points.set(update.ids, update.points)
         self.points.remove(update.removed)
         for position, pose in update.poses.items():
             self.images[position].rotation, self.images[position].translation = pose
+        for position, covariance in update.covariances.items():
+            self.images[position].covariance = covariance
         for position, affine in update.affines.items():
             self.images[position].affine = affine
         self.outliers = update.outliers

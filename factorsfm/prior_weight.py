@@ -60,9 +60,9 @@ def sample_points(count: int, seed: int = 0) -> Index:
 
 
 def usual_weight(angles: Array) -> PriorWeight:
-    """What networks are like, for points in some directions (n, 2)."""
+    """What networks are like at worst usually, for points in some directions (n, 2)."""
     length = float(np.sqrt(np.prod(_LENGTHS)) * np.ptp(angles, axis=0).max())
-    return PriorWeight(_USUAL_SMOOTH, _USUAL_LOCAL, max(length, 1e-6), 1.0)
+    return PriorWeight(_USUAL_FACTOR * _USUAL_SMOOTH, _USUAL_FACTOR * _USUAL_LOCAL, max(length, 1e-6), 1.0)
 
 
 def measure_weight(angles: Array, inverse_depth: Array, prior: Array, covariance: Array) -> PriorWeight:

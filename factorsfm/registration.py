@@ -66,6 +66,7 @@ class Registration:
         inliers: (n,) which correspondences the pose explains.
         error: median reprojection error of the inliers (pixels).
         threshold: reprojection error up to which a correspondence is an inlier (pixels).
+        covariance: (6, 6) of the pose on a map without error (`FrameResult.covariance`).
         affine: scale and shift (or gamma and beta) where depth took part.
     """
 
@@ -74,6 +75,7 @@ class Registration:
     inliers: NDArray[np.bool_]
     error: float
     threshold: float
+    covariance: Array
     affine: tuple[float, float] | None = None
 
 
@@ -161,8 +163,12 @@ def _optimize(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.
 
 def _align(
     points: Array, observed: Array, rotation: Array, translation: Array, focal: float, sigma: float
-) -> tuple[Array, Array]:
-    """Minimum of `image_reprojection_factor` over the pose, in numpy: it is asked for several times a frame."""
+) -> tuple[Array, Array, Array]:
+    """Minimum of `image_reprojection_factor` over the pose, in numpy: it is asked for several times a frame.
+
+    Returns:
+        Rotation, translation, and the information matrix of the pose.
+    """
     one = np.ones(len(points))
     damping, best = 1e-6, np.inf
     normal, gradient = np.eye(6), np.zeros(6)
@@ -190,7 +196,7 @@ def _align(
         step = -np.linalg.solve(normal + damping * np.diag(normal.diagonal() + 1e-12), gradient)
         turn = cv2.Rodrigues(-step[:3])[0]
         candidate = turn @ rotation, turn @ (translation - step[3:])
-    return rotation, translation
+    return rotation, translation, normal
 
 
 def _refine(
@@ -204,14 +210,16 @@ def _refine(
 ) -> Registration:
     """Robust pose; the kernel follows the spread of the residuals, since a young map is not yet exact."""
     error = _residuals(points, observed, rotation, translation, focal)
+    information = np.eye(6)
     for _ in range(2):
         spread = min(max(sigma, _typical(error)), 100.0 * sigma)
-        rotation, translation = _align(points, observed, rotation, translation, focal, spread)
+        rotation, translation, information = _align(points, observed, rotation, translation, focal, spread)
         error = _residuals(points, observed, rotation, translation, focal)
     threshold = max(inlier_px, min(4.0 * _typical(error), 8.0 * inlier_px))
     inliers = error < threshold
     typical = float(np.median(error[inliers])) if inliers.any() else float("inf")
-    return Registration(rotation, translation, inliers, typical, threshold)
+    covariance = np.asarray(np.linalg.inv(information + 1e-9 * np.diag(information.diagonal() + 1e-12)), np.float64)
+    return Registration(rotation, translation, inliers, typical, threshold, covariance)
 
 
 def _pnp_ransac(points: Array, observed: Array, focal: float, threshold_px: float) -> tuple[Array, Array] | None:
@@ -266,5 +274,6 @@ def _refine_with_depth(
         inliers,
         float(np.median(error[inliers])),
         result.threshold,
+        result.covariance,
         (float(scale), float(shift)),
     )

@@ -31,14 +31,27 @@ _BLANK_TEXTURE = 0.2  # grey levels; below this an image is black, white or out 
 
 
 @dataclass(frozen=True, slots=True)
+class KeyframePrior:
+    """Scale and shift of a keyframe's depth map beside the map, in the prior's unit: ``scale / z + shift``."""
+
+    index: int
+    scale: float
+    shift: float
+
+
+@dataclass(frozen=True, slots=True)
 class FrameUpdate:
     """What is known of a frame right after it was pushed.
 
     Attributes:
         index: of the frame; status, message: see `FrameResult`.
         cam_from_world: pose now, causal; None where the frame is not registered.
-        keyframe: whether it entered the graph.
+        keyframe: whether the graph has been given it.
         tracks, inliers: tracked points, and those that agree with the pose.
+        new_points: points that the map gained since the frame before.
+        parallax: largest camera displacement so far over the median depth of the points seen.
+        covariance: (6, 6) of the pose (see `FrameResult`), the uncertainty of the map included; None without a pose.
+        prior: the newest depth map that the graph has used, None as long as there is none.
     """
 
     index: int
@@ -48,6 +61,10 @@ class FrameUpdate:
     keyframe: bool
     tracks: int
     inliers: int
+    new_points: int = 0
+    parallax: float = 0.0
+    covariance: NDArray[np.float64] | None = None
+    prior: KeyframePrior | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +150,7 @@ class Stream:
         self._tracker.drop(mapper.outliers)
         if image.status is not FrameStatus.WAITING:  # it may still take part in the start
             _mark_blank(image, tracked.texture)
-        return _update(frame.index, image)
+        return self._frame_update(frame.index, image)
 
     def trajectory(self) -> list[pycolmap.Rigid3d | None]:
         """`cam_from_world` of every frame so far as the graph knows it now, None where a frame is not registered.
@@ -200,6 +217,22 @@ class Stream:
         focal = 0.5 * (self.camera.focal_length_x + self.camera.focal_length_y)
         self._mapper = Mapper(focal, width, self.options, has_prior=self._depth is not None)
         return self._mapper
+
+    def _frame_update(self, index: int, image: MappedImage) -> FrameUpdate:
+        mapper = self._mapper
+        assert mapper is not None
+        prior = None
+        guided = [k for k in mapper.keyframes if mapper.images[k].affine and mapper.images[k].tracks.depth]
+        if guided:
+            keyframe = mapper.images[guided[-1]]
+            assert keyframe.affine is not None
+            assert keyframe.tracks.depth is not None
+            unit = keyframe.tracks.depth.unit
+            prior = KeyframePrior(self.frames[guided[-1]].index, keyframe.affine[0] * unit, keyframe.affine[1] * unit)
+        return FrameUpdate(
+            index, image.status, image.message, _pose(image), image.keyframe, len(image.tracks.ids), image.inliers,
+            mapper.new_points, mapper.parallax, image.covariance, prior,
+        )  # fmt: skip
 
     def _failure(self, message: str) -> ReconstructionError:
         images = self._mapper.images if self._mapper is not None else []
@@ -274,11 +307,6 @@ def _mark_blank(image: MappedImage, texture: float) -> None:
     if texture < _BLANK_TEXTURE and not image.registered:
         image.status = FrameStatus.BLANK
         image.message = f"contrast {texture:.2f} of {_BLANK_TEXTURE:.2f} needed grey levels"
-
-
-def _update(index: int, image: MappedImage) -> FrameUpdate:
-    tracks = len(image.tracks.ids)
-    return FrameUpdate(index, image.status, image.message, _pose(image), image.keyframe, tracks, image.inliers)
 
 
 def _pose(image: MappedImage) -> pycolmap.Rigid3d | None:
