@@ -47,7 +47,7 @@ def read_camera(path: str | Path) -> pycolmap.Camera:
     if not isinstance(content, dict):
         raise InputError(f"camera file {path} holds a {type(content).__name__}; a JSON object is expected")
     try:
-        return _camera_from_json(content)
+        return camera_from_json(content)
     except InputError as error:
         raise InputError(f"camera file {path}: {error}") from error
 
@@ -121,7 +121,8 @@ def pixels_from_normalized(camera: pycolmap.Camera, uv: NDArray[np.float64]) -> 
     return np.asarray(camera.img_from_cam(rays), dtype=np.float64) - PIXEL_CENTER
 
 
-def _camera_from_json(content: Mapping[str, Any]) -> pycolmap.Camera:
+def camera_from_json(content: Mapping[str, Any]) -> pycolmap.Camera:
+    """A camera from the content of a camera file; errors as in `read_camera`."""
     width, height = (_size(content, key) for key in ("width", "height"))
     if ("model" in content) != ("params" in content):
         raise InputError('"model" and "params" go together; one of them is missing')

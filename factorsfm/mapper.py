@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.factors import cross_matrix
+from factorsfm.factors import camera_points, cross_matrix
 from factorsfm.graph import FactorGraph
 from factorsfm.images import ImageTracks, MappedImage, median_flow
 from factorsfm.initialization import NoStart, Start, start_essential, start_lifted, start_pair
@@ -26,9 +27,13 @@ Index = NDArray[np.int64]
 logger = logging.getLogger(__name__)
 
 _PAIR_WINDOW = 10  # images among which the paper's initial pair is sought
+_STATE = (
+    "focal", "keyframes", "new_points", "parallax", "started", "_start_kind", "_waits_for_depth", "_due",
+)  # fmt: skip
 _LIFT_PATIENCE = 10  # images without a usable depth map after which the start does without
 _DEPTH_PATIENCE = 3  # keyframes without a depth map after which one does without
 _YOUNG_ERROR = 0.8  # relative, of a map that only the prior has shaped; falls with the square of the keyframes
+_LEAST_RELOCALIZED = 0.3  # of the similar corners must agree with the pose
 _LEAST_SHARED = 0.7  # of the tracks of the last keyframe; with fewer, a new one is made
 
 
@@ -59,9 +64,31 @@ class Mapper:
             self._start_kind == "pair" or self.options.registration_depth != "none"
         )
         self._uses_keyframe_depth = has_prior and options.uses_depth
-        self._started = False
+        self.started = False
         self.points = PointMap()
         self._waits_for_depth = 0
+
+    # --- snapshots ----------------------------------------------------------------------------------------------
+
+    def state(self) -> dict[str, Any]:
+        """Everything that `restore` needs; waits for what the graph is working on."""
+        update = self._update.result() if self._update is not None else None
+        return {
+            **{name: getattr(self, name) for name in _STATE},
+            "images": list(self.images),
+            "points": self.points.table,
+            "update": update,
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go on where `state` was taken. The graph is rebuilt from the map at its next update."""
+        for name in _STATE:
+            setattr(self, name, state[name])
+        self.images = list(state["images"])
+        self.points = PointMap(state["points"])
+        if state["update"] is not None:
+            self._update = Future()
+            self._update.set_result(state["update"])
 
     # --- the algorithm ------------------------------------------------------------------------------------------
 
@@ -90,7 +117,7 @@ class Mapper:
         if len(image.tracks.ids) < self.options.min_tracks:
             image.status = FrameStatus.TOO_FEW_TRACKS
             image.message = f"{len(image.tracks.ids)} of {self.options.min_tracks} needed tracks"
-        elif not self._started:
+        elif not self.started:
             self._try_start(image, read_depth)
         else:
             self._register(image)
@@ -99,14 +126,18 @@ class Mapper:
 
     def finish(self) -> None:
         """No more images: start with what there is, if nothing better came; all images on the map as it is at last."""
-        if not self._started and self._start_kind == "pair":
+        if not self.started and self._start_kind == "pair":
             self._begin(self._start_from_pair())
-        if not self._started:
+        if not self.started:
             self._begin(self._start_essential(angle_deg=0.0))
-        if not self._started:
+        if not self.started:
             self._begin(self._start_flat())
         self.refresh()
-        self._worker.shutdown()
+        self.close()
+
+    def close(self) -> None:
+        """Let the graph go; what it is working on is lost."""
+        self._worker.shutdown(cancel_futures=True)
 
     def refresh(self) -> None:
         """Register the images between the keyframes once more, on the map as it is now."""
@@ -174,7 +205,7 @@ class Mapper:
             for image in self._waiting():
                 image.message = start.reason
             return
-        self._started = True
+        self.started = True
         self.points.set(start.ids, start.points)
         self.new_points = len(start.ids)
         waiting = self._waiting()
@@ -202,7 +233,7 @@ class Mapper:
         tracks = image.tracks
         mapped = self.points.contains(tracks.ids)
         if mapped.sum() < o.min_inliers:
-            image.status = FrameStatus.TOO_FEW_TRACKS
+            image.status = FrameStatus.LOST
             image.message = f"{mapped.sum()} of {o.min_inliers} needed tracks have a point in the map"
             return
         near = image if image.registered else self._nearest_registered(tracks.position)
@@ -228,6 +259,38 @@ class Mapper:
         inliers = np.zeros(len(tracks.ids), bool)
         inliers[np.nonzero(mapped)[0][result.inliers]] = True
         self._accept(image, replace(result, inliers=inliers))
+
+    def relocalize(self, image: MappedImage, ids: Index, xy: Array) -> bool:
+        """Register an image by what its descriptors say that it shows; whether that worked.
+
+        Args:
+            ids: (n,) tracks that look like corners of the image; xy: (n, 2) these corners, normalised.
+        """
+        o = self.options
+        known = self.points.contains(ids)
+        if known.sum() < o.min_inliers:
+            return False
+        near = self._nearest_registered(image.tracks.position)
+        result = register_image(
+            self.points.at(ids[known]), xy[known], *near.pose,
+            focal=self.focal, sigma=o.pixel_sigma, inlier_px=o.inlier_px,
+        )  # fmt: skip
+        found = int(result.inliers.sum())
+        if found < max(o.min_inliers, _LEAST_RELOCALIZED * known.sum()):
+            image.message += f"; not found again: {found} of {known.sum()} similar corners agree"
+            return False
+        self._accept(image, replace(result, inliers=np.zeros(len(image.tracks.ids), bool)))
+        image.inliers = found
+        image.message = f"found again: {found} of {known.sum()} similar corners agree"
+        return True
+
+    def visible(self, image: MappedImage, ids: Index) -> tuple[Index, Array]:
+        """Tracks with a point in front of a registered image, and where it is seen (normalised)."""
+        ids = ids[self.points.contains(ids)]
+        rotation, translation = image.pose
+        q = camera_points(rotation, translation, self.points.at(ids), np.ones(len(ids)))
+        front = q[:, 2] > 1e-6
+        return ids[front], q[front, :2] / q[front, 2:]
 
     def _nearest_registered(self, position: int) -> MappedImage:
         for offset in range(1, len(self.images)):

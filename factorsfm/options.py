@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
@@ -139,6 +140,19 @@ class Options:
     def to_dict(self) -> dict[str, Any]:
         """Plain data, as written beside every result."""
         return asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Options:
+        """Inverse of `to_dict`.
+
+        Raises:
+            InputError: an option is unknown.
+        """
+        parts = {"tracker": TrackerOptions, "mapper": MapperOptions, "polish": PolishOptions}
+        try:
+            return cls(**{key: parts[key](**value) if key in parts else value for key, value in values.items()})
+        except TypeError as error:
+            raise InputError(f"these are not the options of this version: {error}") from error
 
     @property
     def uses_depth(self) -> bool:

@@ -16,8 +16,8 @@ Mask = NDArray[np.bool_]
 class PointMap:
     """World positions by track id."""
 
-    def __init__(self) -> None:
-        self._points = np.full((1024, 3), np.nan)
+    def __init__(self, points: Array | None = None) -> None:
+        self._points = np.full((1024, 3), np.nan) if points is None else points.copy()
 
     def contains(self, ids: Index) -> Mask:
         """Which of the tracks have a position."""
@@ -42,9 +42,12 @@ class PointMap:
 
     def copy(self) -> PointMap:
         """An independent copy."""
-        other = PointMap()
-        other._points = self._points.copy()
-        return other
+        return PointMap(self._points)
+
+    @property
+    def table(self) -> Array:
+        """Positions by track id, NaN where there is none."""
+        return self._points
 
     def all(self) -> tuple[Index, Array]:
         """Track ids (ascending) and positions of all points."""

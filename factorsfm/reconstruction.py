@@ -19,6 +19,7 @@ class FrameStatus(StrEnum):
     STATIC = "static"  # registered; the camera does not move measurably against the first frame
     TOO_FEW_TRACKS = "too_few_tracks"
     TOO_FEW_INLIERS = "too_few_inliers"
+    LOST = "lost"  # what the image shows is not in the map
     BLANK = "blank"  # black, white or blurred: no texture to track
     WAITING = "waiting"  # not yet initialised
 

@@ -6,14 +6,25 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any
 
+import cv2
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from factorsfm.camera import check_camera, guess_camera, normalized_from_pixels
+from factorsfm.camera import (
+    camera_from_json,
+    camera_to_json,
+    check_camera,
+    guess_camera,
+    normalized_from_pixels,
+    pixels_from_normalized,
+)
 from factorsfm.errors import FactorsfmError, InputError, ModelError, ReconstructionError
 from factorsfm.frames import Frame, bgr_image
 from factorsfm.images import ImageTracks, MappedImage
@@ -24,9 +35,13 @@ from factorsfm.priors.depth import DepthKind, DepthPrior
 from factorsfm.priors.masks import MaskPrior
 from factorsfm.reconstruction import FrameResult, FrameStatus, Reconstruction
 from factorsfm.registration import ImageDepth
+from factorsfm.relocalization import Relocalizer
 from factorsfm.result import assemble
+from factorsfm.snapshot import read_snapshot, write_snapshot
 from factorsfm.tracks.flow import FlowTracker
 
+_STATE = ("_size", "_colors", "_pixels", "_focal_guessed")
+_REVIVAL_INTERVAL = 5  # frames
 _BLANK_TEXTURE = 0.2  # grey levels; below this an image is black, white or out of focus
 
 
@@ -52,6 +67,9 @@ class FrameUpdate:
         parallax: largest camera displacement so far over the median depth of the points seen.
         covariance: (6, 6) of the pose (see `FrameResult`), the uncertainty of the map included; None without a pose.
         prior: the newest depth map that the graph has used, None as long as there is none.
+        dropped: frames that a live source dropped right before this one.
+        shot: number of the shot in an `Episode`.
+        focal_length: pixels, as the stream has it now; focal_changed: whether this frame changed it.
     """
 
     index: int
@@ -65,6 +83,10 @@ class FrameUpdate:
     parallax: float = 0.0
     covariance: NDArray[np.float64] | None = None
     prior: KeyframePrior | None = None
+    dropped: int = 0
+    shot: int = 0
+    focal_length: float = float("nan")
+    focal_changed: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +130,7 @@ class Stream:
         self._depth = depth if self.options.uses_depth else None
         self._masks = masks
         self._tracker = FlowTracker(self.options.tracker)
+        self._relocalizer = Relocalizer()
         self._mapper: Mapper | None = None
         self._size = (0, 0)
         self._colors = np.zeros((0, 3), np.uint8)
@@ -124,9 +147,7 @@ class Stream:
             InputError: it is no image, its size differs from that of the frames before or contradicts the camera, or
                 a prior fails on it; after the former the stream can go on with another frame.
         """
-        if not isinstance(frame, Frame):
-            frame = Frame(len(self.frames), frame, f"{len(self.frames):06d}", None)
-        frame = replace(frame, image=bgr_image(frame.image, frame.index))
+        frame = as_frame(frame, len(self.frames))
         mapper = self._mapper or self._open(frame)
         if frame.image.shape[1::-1] != self._size:
             raise InputError(
@@ -138,6 +159,7 @@ class Stream:
         with self._timed("tracking"):
             tracked = self._tracker.track(frame.image, mask)
         self._remember_colors(frame.image, tracked.ids, tracked.xy)
+        grey = cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY)
         xy = normalized_from_pixels(self.camera, tracked.xy)
         usable = np.isfinite(xy).all(axis=1)  # a distortion model may have no inverse in the corners
         usable &= tracked.texture >= _BLANK_TEXTURE  # what is tracked in a blank image is its noise
@@ -148,9 +170,11 @@ class Stream:
         self.frames.append(SeenFrame(frame.index, frame.name, frame.timestamp, tracked.texture))
         self._pixels.append(pixels)
         self._tracker.drop(mapper.outliers)
+        with self._timed("relocalization"):
+            self._keep_in_sight(image, grey, pixels)
         if image.status is not FrameStatus.WAITING:  # it may still take part in the start
             _mark_blank(image, tracked.texture)
-        return self._frame_update(frame.index, image)
+        return self._frame_update(frame, image)
 
     def trajectory(self) -> list[pycolmap.Rigid3d | None]:
         """`cam_from_world` of every frame so far as the graph knows it now, None where a frame is not registered.
@@ -161,6 +185,57 @@ class Stream:
             return []
         self._mapper.refresh()
         return [_pose(image) for image in self._mapper.images]
+
+    def save(self, path: str | Path) -> None:
+        """Write everything that is known so far as one file, whole or not at all; the stream can go on.
+
+        Raises:
+            InputError: the file cannot be written.
+        """
+        write_snapshot(
+            Path(path),
+            {
+                **{name: getattr(self, name) for name in _STATE},
+                "camera": camera_to_json(self.camera) if self.camera is not None else None,
+                "options": self.options.to_dict(),
+                "seconds": dict(self.seconds),
+                "frames": [astuple(frame) for frame in self.frames],
+                "tracker": self._tracker.state(),
+                "views": self._relocalizer.views,
+                "mapper": self._mapper.state() if self._mapper is not None else None,
+            },
+        )
+
+    @classmethod
+    def load(cls, path: str | Path, *, depth: DepthPrior | None = None, masks: MaskPrior | None = None) -> Stream:
+        """Go on where a stream was saved; the next frame to push is number `len(stream.frames)`.
+
+        Args:
+            path: of the snapshot; depth, masks: the priors that the stream had.
+
+        Raises:
+            InputError: the file cannot be read, is torn, or is no snapshot.
+        """
+        state = read_snapshot(Path(path))
+        try:
+            stream = cls(depth=depth, masks=masks, options=Options.from_dict(state["options"]))
+            stream._restore(state)
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise InputError(f"snapshot {path} does not hold the state of a stream: {error!r}") from error
+        return stream
+
+    def _restore(self, state: dict[str, Any]) -> None:
+        for name in _STATE:
+            setattr(self, name, state[name])
+        if state["camera"] is not None:
+            self.camera = camera_from_json(state["camera"])
+        self.seconds.update(state["seconds"])
+        self.frames = [SeenFrame(*frame) for frame in state["frames"]]
+        self._tracker.restore(state["tracker"])
+        self._relocalizer = Relocalizer(state["views"])
+        if state["mapper"] is not None:
+            self._mapper = self._new_mapper()
+            self._mapper.restore(state["mapper"])
 
     def finish(self, progress: Callable[[str, int, int | None], None] | None = None) -> Reconstruction:
         """Polish over all frames and tracks.
@@ -205,6 +280,34 @@ class Stream:
             options=self.options.to_dict(),
         )
 
+    def close(self) -> None:
+        """Give up without a result; `finish` closes, too."""
+        if self._mapper is not None:
+            self._mapper.close()
+
+    def __enter__(self) -> Stream:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _keep_in_sight(self, image: MappedImage, grey: NDArray[np.uint8], pixels: NDArray[np.float64]) -> None:
+        """Find the view again where it was lost, and take up tracks again whose points are back in it."""
+        mapper = self._mapper
+        assert mapper is not None
+        if image.keyframe:
+            self._relocalizer.remember(grey, image.tracks.ids, pixels)
+        lost = mapper.started and not image.registered
+        if lost:
+            ids, rows = self._relocalizer.find(grey, pixels)
+            if not mapper.relocalize(image, ids, image.tracks.xy[rows]):
+                return
+        if image.registered and (lost or image.tracks.position % _REVIVAL_INTERVAL == 0):
+            ids, xy = mapper.visible(image, self._tracker.ended)
+            self._tracker.revive(grey, ids, pixels_from_normalized(self.camera, xy))
+
     def _open(self, frame: Frame) -> Mapper:
         """Everything that waits for the size of the first frame."""
         height, width = frame.image.shape[:2]
@@ -214,11 +317,15 @@ class Stream:
         self._focal_guessed = self.options.refine_focal_length
         check_camera(self.camera, width, height)
         self._size = (width, height)
-        focal = 0.5 * (self.camera.focal_length_x + self.camera.focal_length_y)
-        self._mapper = Mapper(focal, width, self.options, has_prior=self._depth is not None)
+        self._mapper = self._new_mapper()
         return self._mapper
 
-    def _frame_update(self, index: int, image: MappedImage) -> FrameUpdate:
+    def _new_mapper(self) -> Mapper:
+        assert self.camera is not None
+        focal = 0.5 * (self.camera.focal_length_x + self.camera.focal_length_y)
+        return Mapper(focal, self._size[0], self.options, has_prior=self._depth is not None)
+
+    def _frame_update(self, frame: Frame, image: MappedImage) -> FrameUpdate:
         mapper = self._mapper
         assert mapper is not None
         prior = None
@@ -230,8 +337,9 @@ class Stream:
             unit = keyframe.tracks.depth.unit
             prior = KeyframePrior(self.frames[guided[-1]].index, keyframe.affine[0] * unit, keyframe.affine[1] * unit)
         return FrameUpdate(
-            index, image.status, image.message, _pose(image), image.keyframe, len(image.tracks.ids), image.inliers,
-            mapper.new_points, mapper.parallax, image.covariance, prior,
+            frame.index, image.status, image.message, _pose(image), image.keyframe, len(image.tracks.ids), image.inliers,
+            mapper.new_points, mapper.parallax, image.covariance, prior, frame.dropped,
+            focal_length=mapper.focal,
         )  # fmt: skip
 
     def _failure(self, message: str) -> ReconstructionError:
@@ -289,6 +397,17 @@ class Stream:
             yield
         finally:
             self.seconds[stage] += time.perf_counter() - start
+
+
+def as_frame(frame: Frame | NDArray[np.uint8], index: int) -> Frame:
+    """A frame with a BGR image; an image alone becomes the frame number `index`.
+
+    Raises:
+        InputError: it is no image.
+    """
+    if not isinstance(frame, Frame):
+        frame = Frame(index, frame, f"{index:06d}", None)
+    return replace(frame, image=bgr_image(frame.image, frame.index))
 
 
 @contextmanager

@@ -1,0 +1,109 @@
+"""A film of several shots: cuts are found while it streams, and every shot becomes a reconstruction of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from factorsfm.errors import ReconstructionError
+from factorsfm.frames import Frame
+from factorsfm.options import Options
+from factorsfm.priors.depth import DepthPrior
+from factorsfm.priors.masks import MaskPrior
+from factorsfm.reconstruction import FrameResult, Reconstruction
+from factorsfm.shots import CutDetector
+from factorsfm.stream import FrameUpdate, Stream, as_frame
+
+_CERTAIN = 5  # frames of a shot after which the one before cannot come back
+
+
+@dataclass(frozen=True, slots=True)
+class ShotResult:
+    """What became of one shot.
+
+    Attributes:
+        first, last: index of its first and last frame.
+        reconstruction: None where the shot cannot be reconstructed.
+        reason: why not, with numbers; empty where it can.
+        frames: statuses of a shot that cannot be reconstructed.
+    """
+
+    first: int
+    last: int
+    reconstruction: Reconstruction | None
+    reason: str = ""
+    frames: Sequence[FrameResult] = ()
+
+
+class Episode:
+    """Incremental reconstruction of a film, a `Stream` for every shot.
+
+    Args:
+        camera: the lens of all shots; None guesses it for each.
+        depth, masks, options: see `Stream`.
+
+    Example:
+        >>> episode = factorsfm.Episode(depth=factorsfm.DepthModel("model.onnx"))  # doctest: +SKIP
+        >>> for frame in factorsfm.read_frames("film.mp4"):  # doctest: +SKIP
+        ...     update = episode.push(frame)
+        >>> for shot in episode.finish():  # doctest: +SKIP
+        ...     print(shot.first, shot.last, shot.reason or shot.reconstruction.kind)
+    """
+
+    def __init__(
+        self,
+        camera: pycolmap.Camera | None = None,
+        *,
+        depth: DepthPrior | None = None,
+        masks: MaskPrior | None = None,
+        options: Options | None = None,
+    ) -> None:
+        self._camera, self._depth, self._masks, self._options = camera, depth, masks, options
+        self._detector = CutDetector()
+        self._streams: dict[int, Stream] = {}
+        self._shot = 0
+        self._pushed = 0
+        self._worker = ThreadPoolExecutor(1, "factorsfm-shots")
+        self._results: list[Future[ShotResult]] = []
+
+    def push(self, frame: Frame | NDArray[np.uint8]) -> FrameUpdate:
+        """Take the next frame; `FrameUpdate.shot` says to which shot it belongs. Errors as in `Stream.push`."""
+        frame = as_frame(frame, self._pushed)
+        shot = self._detector.push(frame).shot
+        self._pushed += 1
+        if shot is not None and shot != self._shot:
+            if shot < self._shot:  # it was an interruption
+                self._streams.pop(self._shot)
+            self._shot = shot
+        if self._shot not in self._streams:
+            self._streams[self._shot] = Stream(
+                self._camera, depth=self._depth, masks=self._masks, options=self._options
+            )
+        stream = self._streams[self._shot]
+        update = stream.push(frame)
+        if len(stream.frames) == _CERTAIN:
+            for number in sorted(self._streams):
+                if number < self._shot:
+                    self._results.append(self._worker.submit(_finish, self._streams.pop(number), None))
+        return replace(update, shot=self._shot)
+
+    def finish(self, progress: Callable[[str, int, int | None], None] | None = None) -> list[ShotResult]:
+        """Polish what is not polished yet; all shots in order of time."""
+        self._results += [
+            self._worker.submit(_finish, self._streams.pop(number), progress) for number in sorted(self._streams)
+        ]
+        self._worker.shutdown()
+        return [result.result() for result in self._results]
+
+
+def _finish(stream: Stream, progress: Callable[[str, int, int | None], None] | None) -> ShotResult:
+    first, last = stream.frames[0].index, stream.frames[-1].index
+    try:
+        return ShotResult(first, last, stream.finish(progress))
+    except ReconstructionError as error:
+        return ShotResult(first, last, None, str(error), error.frames)

@@ -1,0 +1,83 @@
+"""A source followed live: its frames are decoded beside the tracking, and every frame gives an update."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import BinaryIO
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from factorsfm.frames import Frame
+from factorsfm.options import Options
+from factorsfm.priors.depth import DepthKind, DepthPrior, open_depth
+from factorsfm.priors.masks import MaskPrior, open_masks
+from factorsfm.reconstruction import Reconstruction
+from factorsfm.sources import RawFormat, Source, open_source
+from factorsfm.stream import FrameUpdate, Stream
+
+
+class Live(Iterator[FrameUpdate]):
+    """Updates of a source's frames; `finish` gives the reconstruction. Made by `track`.
+
+    Attributes:
+        source: says how it ended. stream: gives the trajectory as it is known now.
+    """
+
+    def __init__(self, source: Source, stream: Stream) -> None:
+        self.source = source
+        self.stream = stream
+
+    def __next__(self) -> FrameUpdate:
+        return self.stream.push(next(self.source))
+
+    def finish(self, progress: Callable[[str, int, int | None], None] | None = None) -> Reconstruction:
+        """Stop reading, and polish over the frames that came; errors as in `Stream.finish`."""
+        self.source.close()
+        return self.stream.finish(progress)
+
+    def __enter__(self) -> Live:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.source.close()
+        self.stream.close()
+
+
+def track(
+    source: str | Path | int | BinaryIO | Iterable[NDArray[np.uint8] | Frame],
+    *,
+    camera: pycolmap.Camera | None = None,
+    depth: str | Path | DepthPrior | None = "tcmonodepth",
+    depth_kind: DepthKind | str | None = None,
+    masks: str | Path | MaskPrior | None = None,
+    preset: str = "default",
+    frames: slice | None = None,
+    raw: RawFormat | None = None,
+    watch: bool = False,
+    drop: bool | None = None,
+) -> Live:
+    """Follow a source: a pose for every frame as it arrives.
+
+    Args:
+        source, frames, raw, watch, drop: see `open_source`.
+        camera, depth, depth_kind, masks, preset: see `reconstruct`.
+
+    Example:
+        >>> with factorsfm.track("shot.mp4") as live:  # doctest: +SKIP
+        ...     for update in live:
+        ...         print(update.index, update.status, update.cam_from_world)
+        ...     reconstruction = live.finish()
+
+    Raises:
+        InputError: the source, the camera or a prior cannot be used.
+    """
+    options = Options.preset_named(preset)
+    prior = open_depth(depth, depth_kind) if options.uses_depth else None
+    stream = Stream(camera, depth=prior, masks=open_masks(masks), options=options)
+    return Live(open_source(source, frames=frames, raw=raw, watch=watch, drop=drop), stream)
