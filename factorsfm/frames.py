@@ -1,13 +1,16 @@
-"""Frames of a shot: from a video file, a folder of images or any iterable of images."""
+"""Frames of a shot: from a video file, a folder of images (also while it is filled) or any iterable of images."""
 
 from __future__ import annotations
 
 import itertools
+import logging
 import os
 import re
+import threading
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -16,10 +19,15 @@ from numpy.typing import NDArray
 
 from factorsfm.errors import InputError
 
+logger = logging.getLogger(__name__)
+
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"})
 
 _RANGE = re.compile(r"(\d*):(\d*)(?::(\d+))?", re.ASCII)
 _JPEG_MARKER = re.compile(rb"\xff+([^\x00\xff\xd0-\xd7])", re.DOTALL)  # neither stuffing nor a restart
+
+_POLL_SECONDS = 0.1  # between two looks at a folder that is being filled
+_PATIENCE_SECONDS = 2.0  # an image that has not changed for so long and still cannot be decoded is damaged
 
 # FFmpeg reports broken files on stderr, past all Python logging; a level that the user set is respected.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
@@ -34,12 +42,14 @@ class Frame:
         image: (h, w, 3) uint8, BGR.
         name: file name, or the zero-padded index for videos and iterables.
         timestamp: seconds from the start of the video, None where unknown.
+        dropped: frames of a live source that were skipped right before this one, because nobody was ready for them.
     """
 
     index: int
     image: NDArray[np.uint8]
     name: str
     timestamp: float | None = None
+    dropped: int = 0
 
 
 def parse_range(text: str) -> slice:
@@ -52,7 +62,7 @@ def parse_range(text: str) -> slice:
     if match is None or not any(match.groups()):
         raise InputError(f'frame range "{text}" is not START:STOP[:STEP] with whole numbers from 0')
     start, stop, step = (int(part) if part else None for part in match.groups())
-    return _checked_range(slice(start, stop, step))
+    return checked_range(slice(start, stop, step))
 
 
 def read_frames(
@@ -73,16 +83,20 @@ def read_frames(
             if an image is unreadable or truncated, if a frame has another size than the first one, or if
             there is no frame to read.
     """
-    selection = _checked_range(frames if frames is not None else slice(None))
+    selection = checked_range(frames if frames is not None else slice(None))
     if isinstance(source, (str, Path)):
         path = Path(source)
         if path.is_dir():
-            found = _folder_frames(_list_images(path), selection)
+            images = list_images(path)
+            if not images:
+                suffixes = ", ".join(sorted(suffix[1:] for suffix in IMAGE_SUFFIXES))
+                raise InputError(f"folder {path} holds no images ({suffixes})")
+            found = _folder_frames(images, selection)
         elif path.is_file():
             found = _video_frames(path, selection, has_timestamps=_probe_video(path))
         else:
             raise InputError(f"{path} does not exist; a video file or a folder of images is expected")
-        return _uniform(found, str(path), selection.start)
+        return uniform(found, str(path), selection.start)
     if isinstance(source, np.ndarray) and (source.ndim == 2 or (source.ndim == 3 and source.shape[-1] in (3, 4))):
         raise InputError(f"an array of shape {source.shape} is a single image; a sequence of images is expected")
     if not isinstance(source, Iterable):
@@ -90,10 +104,15 @@ def read_frames(
             f"frames cannot be read from a {type(source).__name__}; "
             "a video file, a folder of images or an iterable of images is expected"
         )
-    return _uniform(_array_frames(source, selection), "the sequence of images", selection.start)
+    return uniform(_array_frames(source, selection), "the sequence of images", selection.start)
 
 
-def _checked_range(frames: slice) -> slice:
+def checked_range(frames: slice) -> slice:
+    """The same range with START and STEP filled in.
+
+    Raises:
+        InputError: a negative number, a step of zero, or a range that holds no frame.
+    """
     start, stop, step = frames.start or 0, frames.stop, 1 if frames.step is None else frames.step
     text = _range_text(frames)
     if start < 0 or (stop is not None and stop < 0) or step < 0:
@@ -110,7 +129,7 @@ def _range_text(frames: slice) -> str:
     return f"{start}:{stop}" + ("" if frames.step is None else f":{frames.step}")
 
 
-def _uniform(frames: Iterator[Frame], source: str, start: int) -> Iterator[Frame]:
+def uniform(frames: Iterator[Frame], source: str, start: int) -> Iterator[Frame]:
     """Pass the frames on and insist that there is one at least and that all have one size."""
     first: Frame | None = None
     for frame in frames:
@@ -158,35 +177,105 @@ def bgr_image(image: object, index: int) -> NDArray[np.uint8]:
     return np.ascontiguousarray(depth8[:, :, :3])
 
 
-def _list_images(folder: Path) -> list[Path]:
+def list_images(folder: Path) -> list[Path]:
+    """Images of a folder in natural order, img2 before img10; none is no error."""
     images = [
         path
         for path in folder.iterdir()
         if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".") and path.is_file()
     ]
-    if not images:
-        suffixes = ", ".join(sorted(suffix[1:] for suffix in IMAGE_SUFFIXES))
-        raise InputError(f"folder {folder} holds no images ({suffixes})")
-    return sorted(images, key=lambda path: (_natural_key(path.name), path.name))
+    return sorted(images, key=_natural_key)
 
 
-def _natural_key(name: str) -> list[str | int]:
-    return [int(part) if i % 2 else part.lower() for i, part in enumerate(re.split(r"(\d+)", name))]
+def _natural_key(path: Path) -> tuple[list[str | int], str]:
+    parts = re.split(r"(\d+)", path.name)
+    return [int(part) if i % 2 else part.lower() for i, part in enumerate(parts)], path.name
 
 
 def _folder_frames(paths: list[Path], selection: slice) -> Iterator[Frame]:
     for index in range(len(paths))[selection]:
-        yield Frame(index, _read_image(paths[index]), paths[index].name)
+        yield Frame(index, read_image(paths[index]), paths[index].name)
 
 
-def _read_image(path: Path) -> NDArray[np.uint8]:
+def watch_folder(folder: Path, end_file: str | Path | None, closed: threading.Event) -> Iterator[Frame]:
+    """Images of a folder that is still being filled, each once it is complete.
+
+    Args:
+        end_file: when it exists (a name in the folder, or a path) nothing further comes.
+        closed: set by another thread when nobody wants further frames.
+    """
+    taken: set[str] = set()
+    last: Path | None = None
+    arrivals: dict[Path, _Arrival] = {}
+    index = 0
+    while not closed.is_set():
+        complete = end_file is not None and (folder / end_file).exists()  # before the look: nothing comes after it
+        waiting = [path for path in list_images(folder) if path.name not in taken]
+        arrivals = {path: _Arrival.seen(path, arrivals.get(path)) for path in waiting}
+        for path, arrival in arrivals.items():
+            late = last is not None and _natural_key(path) < _natural_key(last)
+            image = None if late else arrival.image(path)
+            if image is None and not late and not arrival.given_up():
+                break
+            taken.add(path.name)
+            if image is None:
+                cause = f"it appeared after {last.name}" if late and last is not None else "it is damaged"
+                logger.warning("image %s is left out: %s", path, cause)
+                continue
+            last = path
+            yield Frame(index, image, path.name)
+            index += 1
+        else:
+            if complete:
+                return
+        closed.wait(_POLL_SECONDS)
+
+
+@dataclass(frozen=True, slots=True)
+class _Arrival:
+    """A file as it was at a look at the folder; `since` is when it was first seen like this."""
+
+    state: tuple[int, int] | None
+    since: float
+    settled: bool
+
+    @staticmethod
+    def seen(path: Path, before: _Arrival | None) -> _Arrival:
+        try:
+            status = path.stat()
+        except OSError:  # renamed or removed since the look
+            return _Arrival(None, time.monotonic(), False)
+        state = (status.st_size, status.st_mtime_ns)
+        if before is None or before.state != state:
+            return _Arrival(state, time.monotonic(), False)
+        return _Arrival(state, before.since, True)
+
+    def image(self, path: Path) -> NDArray[np.uint8] | None:
+        """None as long as the file is not complete."""
+        if not self.settled:
+            return None
+        try:
+            return read_image(path)
+        except InputError:
+            return None
+
+    def given_up(self) -> bool:
+        return time.monotonic() - self.since > _PATIENCE_SECONDS
+
+
+def read_image(path: Path) -> NDArray[np.uint8]:
+    """(h, w, 3) BGR.
+
+    Raises:
+        InputError: the file is missing, damaged, truncated or no image.
+    """
     try:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"image {path} cannot be read: {error.strerror}") from error
     if data.startswith(b"\xff\xd8") and _jpeg_is_truncated(data):
         raise InputError(f"image {path} is truncated")
-    with _quiet_opencv():
+    with quiet_opencv():
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
     if image is None:
         raise InputError(f"image {path} cannot be decoded; it is damaged, truncated or not an image")
@@ -231,7 +320,7 @@ def _video_frames(path: Path, selection: slice, has_timestamps: bool) -> Iterato
 
 @contextmanager
 def _open_video(path: Path) -> Iterator[cv2.VideoCapture]:
-    with _quiet_opencv():
+    with quiet_opencv():
         video = cv2.VideoCapture(str(path))
     try:
         yield video
@@ -239,12 +328,30 @@ def _open_video(path: Path) -> Iterator[cv2.VideoCapture]:
         video.release()
 
 
+@dataclass(slots=True)
+class _Silence:
+    """The log level of OpenCV belongs to the process: the first thread in saves it, the last one out restores it."""
+
+    lock: threading.Lock = field(default_factory=threading.Lock)
+    wanted: int = 0
+    level: int = 0
+
+
+_silence = _Silence()
+
+
 @contextmanager
-def _quiet_opencv() -> Iterator[None]:
+def quiet_opencv() -> Iterator[None]:
     """Keep OpenCV from writing to stderr what is reported as an InputError."""
-    level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    with _silence.lock:
+        if _silence.wanted == 0:
+            _silence.level = cv2.utils.logging.getLogLevel()
+            cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+        _silence.wanted += 1
     try:
         yield
     finally:
-        cv2.utils.logging.setLogLevel(level)
+        with _silence.lock:
+            _silence.wanted -= 1
+            if _silence.wanted == 0:
+                cv2.utils.logging.setLogLevel(_silence.level)
