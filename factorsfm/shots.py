@@ -62,7 +62,6 @@ class ShotUpdate:
 @dataclass(slots=True)
 class _Shot:
     number: int
-    begin: int
     end: int  # its last frame
     view: _View
     history: deque[float] = field(default_factory=lambda: deque(maxlen=_HISTORY))
@@ -141,7 +140,7 @@ class CutDetector:
         return self._begin(index, view, difference, f"{kind}: dissimilarity {difference:.2f}, limit {threshold:.2f}")
 
     def _begin(self, index: int, view: _View, difference: float, reason: str) -> ShotUpdate:
-        self._shot = _Shot(self._shots, index, index, view)
+        self._shot = _Shot(self._shots, index, view)
         self._shots += 1
         return ShotUpdate(index, self._shot.number, True, difference, reason)
 
