@@ -1,4 +1,4 @@
-"""Frames of a shot: from a video file, a folder of images or any iterable of images."""
+"""Frames of a shot: from a video file, a folder of images (also while it is filled) or any iterable of images."""
 
 from __future__ import annotations
 

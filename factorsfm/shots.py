@@ -62,7 +62,6 @@ class ShotUpdate:
 @dataclass(slots=True)
 class _Shot:
     number: int
-    begin: int
     end: int  # its last frame
     view: _View
     history: deque[float] = field(default_factory=lambda: deque(maxlen=_HISTORY))
@@ -78,8 +77,10 @@ class CutDetector:
 
     Found are hard cuts, and fades through black or white: the shot ends where the image has gone blank, the next begins
     where there is something to see again. A black or blown-out stretch with the same view before and after is no cut,
-    nor are up to four frames of something else. A dissolve from one view straight into another is not found. Frames
-    must come from a video: photographs taken far apart differ as much as two shots do.
+    nor are up to four frames of something else. Not found are dissolves from one view straight into another, and cuts
+    to almost the same view. Taken for cuts are jumps of more than about a tenth of the image from frame to frame, and
+    somebody who fills half of it within a few frames. Frames must come from a video: photographs taken far apart differ
+    as much as two shots do.
 
     Example:
         >>> detector = CutDetector()
@@ -139,7 +140,7 @@ class CutDetector:
         return self._begin(index, view, difference, f"{kind}: dissimilarity {difference:.2f}, limit {threshold:.2f}")
 
     def _begin(self, index: int, view: _View, difference: float, reason: str) -> ShotUpdate:
-        self._shot = _Shot(self._shots, index, index, view)
+        self._shot = _Shot(self._shots, index, view)
         self._shots += 1
         return ShotUpdate(index, self._shot.number, True, difference, reason)
 

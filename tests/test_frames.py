@@ -1,4 +1,6 @@
 import itertools
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 
 import cv2
@@ -6,7 +8,7 @@ import numpy as np
 import pytest
 
 from factorsfm.errors import InputError
-from factorsfm.frames import Frame, parse_range, read_frames
+from factorsfm.frames import Frame, parse_range, quiet_opencv, read_frames
 
 RNG = np.random.default_rng(0)
 
@@ -263,3 +265,15 @@ def test_no_frame_at_all_is_an_error(video):
         list(read_frames(video, slice(50, 60)))
     with pytest.raises(InputError, match="the sequence of images holds no frames"):
         list(read_frames([]))
+
+
+def test_two_threads_that_silence_opencv_restore_its_level():
+    before = cv2.utils.logging.getLogLevel()
+    with ThreadPoolExecutor(1) as other, ExitStack() as first:
+        first.enter_context(quiet_opencv())
+        second = quiet_opencv()
+        other.submit(second.__enter__).result()
+        first.close()
+        assert cv2.utils.logging.getLogLevel() == cv2.utils.logging.LOG_LEVEL_SILENT
+        other.submit(second.__exit__, None, None, None).result()
+    assert cv2.utils.logging.getLogLevel() == before
