@@ -8,18 +8,25 @@ that map and aligned with the current frame once more, which cancels the drift w
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.options import TrackerOptions
+from factorsfm.tracks.patches import Array, BirthPatches, Image, in_parts
 
-Array = NDArray[np.float32]
-Image = NDArray[np.uint8]
+_STATE = ("_texture", "_frame", "_next_id", "_ids", "_xy", "_born_at", "_velocity", "_ended")
+_MOST_ENDED = 3000  # tracks that are remembered
+_REVIVAL_REACH = 2.0  # times that of a re-alignment: where a track should be is known less well
+_SCOUTS = 64
+import os
 
-_PATCH_SUPPORT = 22  # half side of a stored birth patch: the window at half the birth's scale, with its margin
+_FC, _FR = float(os.environ.get("FC", ".3")), float(os.environ.get("FR", "3"))
 _GRID = 24  # cells along the longer image side in which the local motion is estimated
 _BLANK_SHARE = 0.2  # of the texture of the last frame; with less, a frame among others is black or a flash
 
@@ -33,7 +40,6 @@ class TrackedFrame:
         xy: (n, 2) pixels, centres at integers.
         lost: tracks that ended here.
         born: tracks that start here.
-        flow: median displacement against the frame before (pixels); NaN in the first frame.
         texture: standard deviation of the Laplacian at the scale of a feature (grey levels), a measure of blankness.
     """
 
@@ -41,8 +47,12 @@ class TrackedFrame:
     xy: NDArray[np.float64]
     lost: int
     born: int
-    flow: float
     texture: float
+
+
+class _Frame(NamedTuple):
+    full: Image
+    half: Image
 
 
 class FlowTracker:
@@ -50,16 +60,20 @@ class FlowTracker:
 
     def __init__(self, options: TrackerOptions) -> None:
         self.options = options
-        self._previous: Image | None = None
+        self._previous: _Frame | None = None
         self._texture = 0.0  # of the previous image
         self._frame = 0
         self._next_id = 0
         self._ids = np.zeros(0, np.int64)
         self._xy = np.zeros((0, 2), np.float32)
         self._born_at = np.zeros(0, np.int64)
-        side = self._tile = 2 * _PATCH_SUPPORT + 1
-        self._patches = np.zeros((0, side, side), np.uint8)
-        self._affine = np.zeros((0, 2, 2), np.float32)  # birth patch -> current frame
+        self._velocity = np.zeros((0, 2), np.float32)
+        self._patches = BirthPatches(options.window_px)
+        self._window = (options.window_px, options.window_px)
+        self._just_ended: list[tuple[NDArray[np.int64], BirthPatches]] = []
+        self._ended = np.zeros(0, np.int64)
+        self._ended_patches = BirthPatches(options.window_px)
+        self._pool = ThreadPoolExecutor(2)
 
     def track(self, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None) -> TrackedFrame:
         """Follow all tracks into `image` and start new ones where the image is not covered.
@@ -69,90 +83,174 @@ class FlowTracker:
             mask: (h, w), True where nothing may be tracked.
         """
         grey = np.ascontiguousarray(image) if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-        texture = _texture(grey)
+        frame = _Frame(grey, _halved(grey))
+        texture = _texture(frame.half)
         if texture < _BLANK_SHARE * self._texture:  # the tracks wait for the next frame that shows something
-            return TrackedFrame(np.zeros(0, np.int64), np.zeros((0, 2)), 0, 0, float("nan"), texture)
+            return TrackedFrame(np.zeros(0, np.int64), np.zeros((0, 2)), 0, 0, texture)
         before = len(self._ids)
-        flow = float("nan")
         if self._previous is not None and before:
-            start = self._xy
-            kept = self._step(self._previous, grey, mask)
-            if len(self._ids):
-                flow = float(np.median(np.linalg.norm(self._xy - start[kept], axis=1)))
+            self._step(self._previous, frame, mask)
         lost = before - len(self._ids)
         born = self._replenish(grey, mask)
-        self._previous, self._texture = grey, texture
+        self._previous, self._texture = frame, texture
         self._frame += 1
-        return TrackedFrame(self._ids.copy(), self._xy.astype(np.float64), lost, born, flow, texture)
+        return TrackedFrame(self._ids.copy(), self._xy.astype(np.float64), lost, born, texture)
 
     def drop(self, ids: NDArray[np.int64]) -> None:
         """End tracks that the mapper found to be outliers."""
         self._keep(~np.isin(self._ids, ids))
 
+    @property
+    def ended(self) -> NDArray[np.int64]:
+        """Tracks that have ended and can be taken up again."""
+        self._gather_ended()
+        return self._ended
+
+    def revive(self, image: NDArray[np.uint8], ids: NDArray[np.int64], xy: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Take up ended tracks in the image just tracked, where their patch is found; the ids of those.
+
+        Args:
+            image: (h, w) grey, the last one tracked.
+            ids: (n,) of ended tracks; xy: (n, 2) where they should be (pixels).
+        """
+        inside = np.isfinite(xy).all(axis=1)
+        inside[inside] = _inside(xy[inside], image.shape, self.options.border_px)
+        if not inside.any():
+            return np.zeros(0, np.int64)
+        order = np.argsort(self._ended)
+        rows = order[np.searchsorted(self._ended, ids[inside], sorter=order)]
+        o = self.options
+        found, good = self._ended_patches.align(
+            image,
+            rows,
+            xy[inside].astype(np.float32),
+            o.realign_check_px,
+            _REVIVAL_REACH * o.realign_reach_px,
+            self._pool,
+        )
+        good &= _inside(found, image.shape, o.border_px)
+        rows, found = rows[good], found[good]
+        revived = self._ended[rows]
+        self._ids = np.r_[self._ids, revived]
+        self._xy = np.r_[self._xy, found]
+        self._velocity = np.r_[self._velocity, np.zeros_like(found)]
+        self._born_at = np.r_[self._born_at, np.full(len(rows), -1)]  # long ago
+        self._patches.append(self._ended_patches.take(rows))
+        self._keep(np.argsort(self._ids))
+        rest = np.ones(len(self._ended), bool)
+        rest[rows] = False
+        self._ended = self._ended[rest]
+        self._ended_patches.keep(rest)
+        return np.asarray(revived)
+
+    def _end(self, rows: NDArray[np.intp]) -> None:
+        """Put tracks aside."""
+        if len(rows):
+            self._just_ended.append((self._ids[rows], self._patches.take(rows)))
+
+    def _gather_ended(self) -> None:
+        """Join what was put aside lately with the rest; the oldest are forgotten where there are too many."""
+        for ids, patches in self._just_ended:
+            self._ended = np.r_[self._ended, ids]
+            self._ended_patches.append(patches)
+        self._just_ended.clear()
+        if len(self._ended) > _MOST_ENDED:
+            self._ended = self._ended[-_MOST_ENDED:]
+            self._ended_patches.keep(slice(-_MOST_ENDED, None))
+
+    def state(self) -> dict[str, Any]:
+        """Everything that `restore` needs."""
+        self._gather_ended()
+        previous = self._previous.full if self._previous is not None else None
+        arrays = {name: getattr(self, name) for name in _STATE}
+        return {**arrays, "previous": previous, "patches": self._patches.state(), "ended": self._ended_patches.state()}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go on where `state` was taken."""
+        for name in _STATE:
+            setattr(self, name, state[name])
+        previous = state["previous"]
+        self._previous = _Frame(previous, _halved(previous)) if previous is not None else None
+        self._patches.restore(state["patches"])
+        self._ended_patches.restore(state["ended"])
+
     def _keep(self, index: NDArray[np.bool_] | NDArray[np.intp]) -> None:
         self._ids = self._ids[index]
         self._xy = self._xy[index]
         self._born_at = self._born_at[index]
-        self._patches = self._patches[index]
-        self._affine = self._affine[index]
+        self._velocity = self._velocity[index]
+        self._patches.keep(index)
 
-    def _step(self, previous: Image, grey: Image, mask: NDArray[np.bool_] | None) -> NDArray[np.intp]:
-        """Flow from the frame before, then re-alignment with the birth patches; returns the kept rows."""
-        o = self.options
-        old = self._xy
-        new, ok = _flow_checked(previous, grey, old, o.window_px, o.levels, o.flow_check_px)
-        ok &= _inside(new, grey.shape, o.border_px)
+    def _step(self, previous: _Frame, frame: _Frame, mask: NDArray[np.bool_] | None) -> None:
+        """Align the patches where their tracks should be; search in the frame before for those that are not there."""
+        o, old, n, grey = self.options, self._xy, len(self._ids), frame.full
+        settled = np.nonzero(self._born_at < self._frame - 1)[0]
+        new, ok = old.copy(), np.zeros(n, bool)
+        if len(settled):
+            start = self._predicted(previous, frame, settled)
+            new[settled], ok[settled] = self._patches.align(
+                grey, settled, start, o.realign_check_px, o.realign_reach_px, self._pool
+            )
+            surprise = np.linalg.norm(new[settled] - start, axis=1)
+            if ok.any():
+                ok[settled] &= surprise < max(0.5, _FR * np.median(surprise[ok[settled]]))
+        search = np.nonzero(~ok)[0]
+        new[search], ok[search] = self._search(previous, frame, old[search])
+        linear = np.empty((n, 2, 2), np.float32)
+        linear[ok] = _local_affine(old[ok], new[ok], grey.shape)
+        linear[~ok] = np.eye(2)
+        self._patches.move(linear)
+        again = np.intersect1d(search[ok[search]], settled)
+        if len(again):
+            new[again], ok[again] = self._patches.align(
+                grey, again, new[again], self.options.realign_check_px, self.options.realign_reach_px, self._pool
+            )
+        ok &= _inside(new, grey.shape, self.options.border_px)
         if mask is not None:
             ok &= ~_at(mask, new)
-        kept = np.nonzero(ok)[0]
-        self._xy = new
-        self._keep(kept)
-        if len(kept) == 0:
-            return kept
-        self._affine = _local_affine(old[kept], self._xy, grey.shape) @ self._affine
-        aligned, good = self._realign(grey)
-        if mask is not None:
-            good &= ~_at(mask, aligned)
-        good &= _inside(aligned, grey.shape, o.border_px)
-        self._xy = aligned
-        self._keep(good)
-        return kept[good]
+        self._xy, self._velocity = new, new - old
+        self._end(np.nonzero(~ok)[0])
+        self._keep(np.nonzero(ok)[0])
 
-    def _realign(self, grey: NDArray[np.uint8]) -> tuple[Array, NDArray[np.bool_]]:
-        """Align every birth patch, warped into the current frame, with the current frame."""
-        o = self.options
-        n = len(self._ids)
-        young = self._born_at >= self._frame - 1
-        half = o.window_px // 2 + 2
-        atlas, centers = _warped_atlas(self._patches, self._affine, half, grey.shape)
-        height = max(atlas.shape[0], grey.shape[0])
-        atlas = cv2.copyMakeBorder(atlas, 0, height - atlas.shape[0], 0, 0, cv2.BORDER_REPLICATE)
-        padded = cv2.copyMakeBorder(grey, 0, height - grey.shape[0], 0, 0, cv2.BORDER_REFLECT_101)
-        aligned, status, _ = cv2.calcOpticalFlowPyrLK(
-            atlas,
-            padded,
-            centers,
-            self._xy.copy(),
-            winSize=(o.window_px, o.window_px),
-            maxLevel=0,
-            criteria=_FINE,
-            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        )
-        back, status_back, _ = cv2.calcOpticalFlowPyrLK(
-            padded,
-            atlas,
-            aligned,
-            centers.copy(),
-            winSize=(o.window_px, o.window_px),
-            maxLevel=0,
-            criteria=_FINE,
-            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        )
-        good = (status[:, 0] == 1) & (status_back[:, 0] == 1)
-        good &= np.linalg.norm(back - centers, axis=1) < o.realign_check_px
-        good &= np.linalg.norm(aligned - self._xy, axis=1) < o.realign_reach_px
-        aligned = np.where(young[:, None], self._xy, aligned)
-        return aligned.reshape(n, 2), good | young
+    def _predicted(self, previous: _Frame, frame: _Frame, rows: NDArray[np.intp]) -> Array:
+        """Where tracks should be: as fast as before, and with the camera's change of motion, which a few tell."""
+        predicted = self._xy[rows] + self._velocity[rows]
+        scouts = np.linspace(0, len(rows) - 1, min(len(rows), _SCOUTS)).astype(int)
+        found, seen = self._roughly(previous, frame, self._xy[rows[scouts]])
+        if seen.sum() < 8:
+            return predicted
+        change, _ = cv2.estimateAffinePartial2D(predicted[scouts[seen]], found[seen], ransacReprojThreshold=1.0)
+        if change is None:
+            return predicted
+        return (predicted @ change[:, :2].T + change[:, 2]).astype(np.float32)
+
+    def _roughly(self, previous: _Frame, frame: _Frame, xy: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Flow of points in the images of half the size, whatever the motion; and where there is any."""
+        found, status, _ = cv2.calcOpticalFlowPyrLK(
+            previous.half, frame.half, (xy - 0.5) / 2, None, winSize=self._window, maxLevel=self.options.levels - 1,
+            criteria=_COARSE,
+        )  # fmt: skip
+        return 2 * found + 0.5, status[:, 0] == 1
+
+    def _search(self, previous: _Frame, frame: _Frame, xy: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Flow of points, and whether the way back, tried from where it should end, stays there."""
+
+        def part(rows: NDArray[np.intp]) -> tuple[Array, NDArray[np.bool_]]:
+            start = xy[rows]
+            rough, _ = self._roughly(previous, frame, start)
+            forward, status, _ = cv2.calcOpticalFlowPyrLK(
+                previous.full, frame.full, start, rough, winSize=self._window, maxLevel=0, criteria=_COARSE,
+                flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+            )  # fmt: skip
+            back, status_back, _ = cv2.calcOpticalFlowPyrLK(
+                frame.full, previous.full, forward, start.copy(), winSize=self._window, maxLevel=1, criteria=_COARSE,
+                flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+            )  # fmt: skip
+            ok = (status[:, 0] == 1) & (status_back[:, 0] == 1)
+            ok &= np.linalg.norm(back - start, axis=1) < self.options.flow_check_px
+            return forward, ok
+
+        return in_parts(part, len(xy), len(xy), self._pool) if len(xy) else (xy, np.zeros(0, bool))
 
     def _replenish(self, grey: NDArray[np.uint8], mask: NDArray[np.bool_] | None) -> int:
         """Start tracks where the image is not covered, strongest corners first in every cell."""
@@ -177,34 +275,24 @@ class FlowTracker:
         self._next_id += m
         self._xy = np.r_[self._xy, corners].astype(np.float32)
         self._born_at = np.r_[self._born_at, np.full(m, self._frame)]
-        self._patches = np.r_[self._patches, _cut_patches(grey, corners, _PATCH_SUPPORT)]
-        self._affine = np.r_[self._affine, np.tile(np.eye(2, dtype=np.float32), (m, 1, 1))]
+        self._velocity = np.r_[self._velocity, np.zeros((m, 2), np.float32)]
+        self._patches.add(grey, corners)
         return m
 
 
 _STOP = cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS
 _COARSE = (_STOP, 12, 0.02)  # from frame to frame: the re-alignment does the rest
-_FINE = (_STOP, 30, 0.003)
 
 
-def _texture(grey: Image) -> float:
+def _halved(grey: Image) -> Image:
+    h, w = grey.shape
+    return cv2.resize(grey[: h // 2 * 2, : w // 2 * 2], (w // 2, h // 2), interpolation=cv2.INTER_AREA)
+
+
+def _texture(half: Image) -> float:
+    """Of the image of half the size, in grey levels of the whole."""
     # In floats: the rounding of 8 bits alone would look like texture.
-    return float(cv2.Laplacian(cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 1.5), cv2.CV_32F).std())
-
-
-def _flow_checked(
-    a: Image, b: Image, xy: Array, window: int, levels: int, limit: float
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Flow a -> b of points, and whether the way back, tried from where it should end, stays there."""
-    side = (window, window)
-    forward, status, _ = cv2.calcOpticalFlowPyrLK(a, b, xy, None, winSize=side, maxLevel=levels, criteria=_COARSE)
-    back, status_back, _ = cv2.calcOpticalFlowPyrLK(
-        b, a, forward, xy.copy(), winSize=side, maxLevel=1, criteria=_COARSE,
-        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-    )  # fmt: skip
-    ok = (status[:, 0] == 1) & (status_back[:, 0] == 1)
-    ok &= np.linalg.norm(back - xy, axis=1) < limit
-    return forward, ok
+    return float(cv2.Laplacian(cv2.GaussianBlur(half.astype(np.float32), (0, 0), 0.7), cv2.CV_32F).std()) / 4
 
 
 def _inside(xy: Array, shape: tuple[int, ...], border: int) -> NDArray[np.bool_]:
@@ -234,25 +322,6 @@ def _spread(corners: Array, count: int, shape: tuple[int, ...]) -> Array:
     return corners[np.argsort(turn, kind="stable")[:count]]
 
 
-def _cut_patches(grey: NDArray[np.uint8], xy: Array, support: int) -> NDArray[np.uint8]:
-    """(n, side, side) patches resampled so that each point lies exactly in the centre; borders as in OpenCV's flow."""
-    offset = np.arange(-support, support + 1, dtype=np.float32)
-    side = len(offset)
-    map_x = np.broadcast_to(xy[:, 0, None, None] + offset, (len(xy), side, side)).reshape(-1, side)
-    map_y = np.broadcast_to(xy[:, 1, None, None] + offset[:, None], (len(xy), side, side)).reshape(-1, side)
-    return _remap(grey, map_x, map_y).reshape(-1, side, side)
-
-
-def _remap(image: NDArray[np.uint8], map_x: Array, map_y: Array) -> NDArray[np.uint8]:
-    """`cv2.remap` with maps of any number of rows (one call takes fewer than 32,768)."""
-    rows = [
-        cv2.remap(image, np.ascontiguousarray(map_x[i : i + 30000]), np.ascontiguousarray(map_y[i : i + 30000]),
-                  cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT_101)
-        for i in range(0, len(map_x), 30000)
-    ]  # fmt: skip
-    return np.concatenate(rows)
-
-
 def _local_affine(old: Array, new: Array, shape: tuple[int, ...]) -> NDArray[np.float32]:
     """(n, 2, 2) linear part of the local motion old -> new: weighted regression on a grid of moments."""
     h, w = shape[:2]
@@ -280,34 +349,3 @@ def _local_affine(old: Array, new: Array, shape: tuple[int, ...]) -> NDArray[np.
         linear[:, row, 0] = (cyy * bx - cxy * by) / det / cell
         linear[:, row, 1] = (cxx * by - cxy * bx) / det / cell
     return np.asarray(np.eye(2) + linear[index], np.float32)
-
-
-def _warped_atlas(
-    patches: NDArray[np.uint8], affine: NDArray[np.float32], half: int, shape: tuple[int, ...]
-) -> tuple[NDArray[np.uint8], Array]:
-    """All patches warped by their affine maps, laid out in one image as wide as the frame, and their centres."""
-    n, side, _ = patches.shape
-    tile = 2 * half + 1
-    offset = np.arange(-half, half + 1, dtype=np.float32)
-    inverse = np.linalg.inv(affine)
-    dx = inverse[:, 0, 0, None, None] * offset + inverse[:, 0, 1, None, None] * offset[:, None]
-    dy = inverse[:, 1, 0, None, None] * offset + inverse[:, 1, 1, None, None] * offset[:, None]
-    support = (side - 1) / 2
-    map_x = np.clip(dx + support, 0, side - 1)
-    map_y = np.clip(dy + support, 0, side - 1) + (np.arange(n) * side)[:, None, None].astype(np.float32)
-    per_call = 30000 // side  # remap reads images of fewer than 32,768 rows
-    tiles = np.concatenate([
-        cv2.remap(patches[i : i + per_call].reshape(-1, side), map_x[i : i + per_call].reshape(-1, tile),
-                  (map_y[i : i + per_call] - np.float32(i * side)).reshape(-1, tile), cv2.INTER_CUBIC,
-                  borderMode=cv2.BORDER_REPLICATE)
-        for i in range(0, n, per_call)
-    ])  # fmt: skip
-    columns = shape[1] // tile
-    rows = -(-n // columns)
-    atlas = np.zeros((rows * columns, tile, tile), np.uint8)
-    atlas[:n] = tiles.reshape(n, tile, tile)
-    atlas = atlas.reshape(rows, columns, tile, tile).transpose(0, 2, 1, 3).reshape(rows * tile, columns * tile)
-    atlas = cv2.copyMakeBorder(atlas, 0, 0, 0, shape[1] - columns * tile, cv2.BORDER_REPLICATE)
-    r, c = np.divmod(np.arange(n), columns)
-    centers = np.stack([c * tile + half, r * tile + half], -1).astype(np.float32)
-    return atlas, centers

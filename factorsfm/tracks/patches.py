@@ -1,0 +1,172 @@
+"""Patches around the first appearance of tracks, aligned with later frames through affine maps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float32]
+Image = NDArray[np.uint8]
+Rows = NDArray[np.intp]
+
+_SUPPORT = 22  # half side of a stored patch: the window at half the birth's scale, with its margin
+_MARGIN = 2  # of a warped patch around the window: interpolation and derivative
+_STALE_PX = 0.1  # change of the map at the edge of the window with which a patch is warped again
+_STOP = cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS
+_FINE = (_STOP, 15, 0.005)
+_BACK = (_STOP, 5, 0.03)  # the way back only has to tell whether it ends where it began
+
+
+_ARRAYS = ("_patches", "_affine", "_warped_by", "_warped")
+
+
+class BirthPatches:
+    """The patch of every track's first appearance and the affine map that carries it into the current frame.
+
+    Args:
+        window_px: side of the Lucas-Kanade window.
+    """
+
+    def __init__(self, window_px: int) -> None:
+        self._window = (window_px, window_px)
+        self._half = window_px // 2 + _MARGIN
+        side, tile = 2 * _SUPPORT + 1, 2 * self._half + 1
+        self._patches = np.zeros((0, side, side), np.uint8)
+        self._affine = np.zeros((0, 2, 2), np.float32)  # birth patch -> current frame
+        self._warped_by = np.zeros((0, 2, 2), np.float32)
+        self._warped = np.zeros((0, tile, tile), np.uint8)
+
+    def add(self, grey: Image, xy: Array) -> None:
+        """Store the patches around points of the current frame."""
+        patches = _cut(grey, xy)
+        unit = np.tile(np.eye(2, dtype=np.float32), (len(xy), 1, 1))
+        inner = slice(_SUPPORT - self._half, _SUPPORT + self._half + 1)
+        self._patches = np.r_[self._patches, patches]
+        self._affine = np.r_[self._affine, unit]
+        self._warped_by = np.r_[self._warped_by, unit]
+        self._warped = np.r_[self._warped, patches[:, inner, inner]]
+
+    def take(self, rows: NDArray[np.bool_] | Rows) -> BirthPatches:
+        """Patches of their own for some of the tracks."""
+        taken = BirthPatches(self._window[0])
+        for name in _ARRAYS:
+            setattr(taken, name, getattr(self, name)[rows])
+        return taken
+
+    def append(self, other: BirthPatches) -> None:
+        """Add the tracks of others."""
+        for name in _ARRAYS:
+            setattr(self, name, np.concatenate([getattr(self, name), getattr(other, name)]))
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """Everything that `restore` needs."""
+        return {name: getattr(self, name) for name in _ARRAYS}
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Go on where `state` was taken."""
+        for name in _ARRAYS:
+            setattr(self, name, state[name])
+
+    def keep(self, index: NDArray[np.bool_] | Rows | slice) -> None:
+        """Forget all others."""
+        self._patches = self._patches[index]
+        self._affine = self._affine[index]
+        self._warped_by = self._warped_by[index]
+        self._warped = self._warped[index]
+
+    def move(self, linear: Array) -> None:
+        """Follow the (n, 2, 2) linear parts of the local motion between two frames."""
+        self._affine = linear @ self._affine
+
+    def align(
+        self, grey: Image, rows: Rows, start: Array, check_px: float, reach_px: float, pool: ThreadPoolExecutor
+    ) -> tuple[Array, NDArray[np.bool_]]:
+        """Align the patches of `rows` with a frame, from `start`; positions, and which of them can be trusted."""
+
+        def part(index: Rows) -> tuple[Array, NDArray[np.bool_]]:
+            return self._align(grey, rows[index], start[index], check_px, reach_px)
+
+        tile = 2 * self._half + 1
+        room = (grey.shape[0] // tile) * (grey.shape[1] // tile)
+        return in_parts(part, len(rows), room, pool)
+
+    def _align(self, grey: Image, rows: Rows, start: Array, check_px: float, reach_px: float) -> tuple[Array, NDArray[np.bool_]]:
+        self._warp(rows)
+        atlas, centers = _atlas(self._warped[rows], grey.shape)
+        aligned, status, _ = cv2.calcOpticalFlowPyrLK(
+            atlas, grey, centers, start.copy(), winSize=self._window, maxLevel=0, criteria=_FINE,
+            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        )  # fmt: skip
+        back, status_back, _ = cv2.calcOpticalFlowPyrLK(
+            grey, atlas, aligned, centers.copy(), winSize=self._window, maxLevel=0, criteria=_BACK,
+            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        )  # fmt: skip
+        good = (status[:, 0] == 1) & (status_back[:, 0] == 1)
+        good &= np.linalg.norm(back - centers, axis=1) < check_px
+        good &= np.linalg.norm(aligned - start, axis=1) < reach_px
+        return aligned, good
+
+    def _warp(self, rows: Rows) -> None:
+        """Warp the patches whose map has changed."""
+        change = np.abs(self._affine[rows] - self._warped_by[rows]).sum(axis=2).max(axis=1) * self._half
+        stale = rows[change > _STALE_PX]
+        self._warped[stale] = _warped(self._patches[stale], self._affine[stale], self._half)
+        self._warped_by[stale] = self._affine[stale]
+
+
+def in_parts(
+    function: Callable[[Rows], tuple[Array, NDArray[np.bool_]]], count: int, room: int, pool: ThreadPoolExecutor
+) -> tuple[Array, NDArray[np.bool_]]:
+    """`function` of the rows 0..count in parts of at most `room`, joined; two parts at least, for two cores."""
+    parts = np.array_split(np.arange(count), max(2 if count > 100 else 1, -(-count // room)))
+    values, flags = zip(*pool.map(function, parts), strict=True)
+    return np.concatenate(values), np.concatenate(flags)
+
+
+def _cut(grey: Image, xy: Array) -> Image:
+    """(n, side, side) patches around points at whole pixels; borders as in OpenCV's flow."""
+    side = 2 * _SUPPORT + 1
+    padded = cv2.copyMakeBorder(grey, _SUPPORT, _SUPPORT, _SUPPORT, _SUPPORT, cv2.BORDER_REFLECT_101)
+    x, y = np.rint(xy).astype(int).T
+    return np.lib.stride_tricks.sliding_window_view(padded, (side, side))[y, x]
+
+
+def _warped(patches: Image, affine: Array, half: int) -> Image:
+    """(n, side, side) patches warped by (n, 2, 2) affine maps about their centres, (n, 2 half + 1, 2 half + 1)."""
+    n, side, _ = patches.shape
+    tile = 2 * half + 1
+    offset = np.arange(-half, half + 1, dtype=np.float32)
+    grid = np.stack([np.tile(offset, tile), np.repeat(offset, tile)])
+    maps = np.linalg.inv(affine) @ grid  # (n, 2, tile * tile)
+    maps += np.float32(_SUPPORT)
+    np.clip(maps, 0, side - 1, out=maps)
+    per_call = 30000 // side  # remap reads images of fewer than 32,768 rows
+    first = np.arange(n) % per_call * side
+    maps[:, 1] += first[:, None]
+    out = np.empty((n, tile, tile), np.uint8)
+    for i in range(0, n, per_call):
+        part = slice(i, i + per_call)
+        out[part] = cv2.remap(
+            patches[part].reshape(-1, side), maps[part, 0].reshape(-1, tile), maps[part, 1].reshape(-1, tile),
+            cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE,
+        ).reshape(-1, tile, tile)  # fmt: skip
+    return out
+
+
+def _atlas(tiles: Image, shape: tuple[int, ...]) -> tuple[Image, Array]:
+    """Square tiles laid out in one image of the frame's size, and their centres."""
+    n, side, _ = tiles.shape
+    columns = shape[1] // side
+    rows = -(-n // columns)
+    atlas = np.zeros(shape, np.uint8)
+    padded = np.zeros((rows * columns, side, side), np.uint8)
+    padded[:n] = tiles
+    body = padded.reshape(rows, columns, side, side).transpose(0, 2, 1, 3)
+    atlas[: rows * side, : columns * side] = body.reshape(rows * side, columns * side)
+    r, c = np.divmod(np.arange(n), columns)
+    return atlas, np.stack([c * side + side // 2, r * side + side // 2], -1).astype(np.float32)
