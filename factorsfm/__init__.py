@@ -6,29 +6,36 @@ import logging
 
 from factorsfm.api import reconstruct
 from factorsfm.camera import guess_camera, read_camera
+from factorsfm.episode import Episode, ShotResult
 from factorsfm.errors import FactorsfmError, InputError, ModelError, ReconstructionError
 from factorsfm.frames import Frame, read_frames
+from factorsfm.live import Live, track
 from factorsfm.options import PRESETS, MapperOptions, Options, PolishOptions, TrackerOptions
 from factorsfm.priors.depth import DepthFolder, DepthKind, DepthMap, DepthModel, DepthPrior
 from factorsfm.priors.masks import MaskFolder, MaskModel, MaskPrior
 from factorsfm.reconstruction import FrameResult, FrameStatus, PriorFit, Reconstruction, ShotKind
+from factorsfm.shots import CutDetector, ShotUpdate, find_shots
+from factorsfm.sources import RawFormat, Source, open_source
 from factorsfm.stream import FrameUpdate, Stream
 
 logging.getLogger(__name__).addHandler(logging.NullHandler())
 
 __all__ = [
     "PRESETS",
+    "CutDetector",
     "DepthFolder",
     "DepthKind",
     "DepthMap",
     "DepthModel",
     "DepthPrior",
+    "Episode",
     "FactorsfmError",
     "Frame",
     "FrameResult",
     "FrameStatus",
     "FrameUpdate",
     "InputError",
+    "Live",
     "MapperOptions",
     "MaskFolder",
     "MaskModel",
@@ -37,13 +44,20 @@ __all__ = [
     "Options",
     "PolishOptions",
     "PriorFit",
+    "RawFormat",
     "Reconstruction",
     "ReconstructionError",
     "ShotKind",
+    "ShotResult",
+    "ShotUpdate",
+    "Source",
     "Stream",
     "TrackerOptions",
+    "find_shots",
     "guess_camera",
+    "open_source",
     "read_camera",
     "read_frames",
     "reconstruct",
+    "track",
 ]

@@ -1,0 +1,237 @@
+"""How the stream keeps up, and how good its poses are at once: ``python -m benchmarks.live --data FOLDER``."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.inputs import open_prior, open_shot
+from benchmarks.plan import FULL, STUDIO
+from benchmarks.run import HERE, machine
+from benchmarks.tables import table
+from factorsfm import Frame, FrameUpdate, MaskFolder, Stream, open_source
+from factorsfm.evaluation.alignment import pose_arrays
+from factorsfm.evaluation.metrics import auc, trajectory_errors
+from factorsfm.evaluation.truth import Shot
+from factorsfm.synthetic import RenderedShot, render_shot
+
+Array = NDArray[np.float64]
+
+_COLUMNS = (("ATE", 0.002), ("ATE", 0.02), ("T-RPE", 0.001), ("T-RPE", 0.005), ("R-RPE", 0.02), ("R-RPE", 0.1))
+_HEADER = ["ATE 0.2 cm", "ATE 2 cm", "T-RPE 0.1 cm", "T-RPE 0.5 cm", "R-RPE 0.02°", "R-RPE 0.1°"]
+_WARM_UP = 500  # frames of the long stream after which memory is measured
+_SIGMAS = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """A stream over one shot.
+
+    Attributes:
+        latency: (n,) seconds of each push. seconds: of the whole, decoding included.
+        errors: per trajectory (ATE, T-RPE, R-RPE) of all frames.
+        inside: (n - 1,) whether the truth lies in the 5-sigma region of the causal pose.
+        extent: of the true path, metres.
+    """
+
+    name: str
+    latency: Array
+    seconds: float
+    errors: dict[str, tuple[Array, Array, Array]]
+    inside: NDArray[np.bool_]
+    extent: float
+
+
+def measure(shot: Shot, data: Path, models: Path, cache: Path) -> Measured:
+    """Stream a shot with TCMonoDepth, then polish it."""
+    stream = Stream(
+        shot.camera,
+        depth=open_prior("tcmonodepth", shot, data, models, cache),
+        masks=MaskFolder(shot.masks) if shot.masks is not None else None,
+    )
+    updates: list[FrameUpdate] = []
+    latency = []
+    begin = time.perf_counter()
+    with open_source(shot.frames()) as source:
+        for frame in source:
+            start = time.perf_counter()
+            updates.append(stream.push(frame))
+            latency.append(time.perf_counter() - start)
+    seconds = time.perf_counter() - begin
+    poses = {
+        "as given": [update.cam_from_world for update in updates],
+        "graph": stream.trajectory(),
+        "polished": [frame.cam_from_world for frame in stream.finish().frames],
+    }
+    errors = {}
+    for name, trajectory in poses.items():
+        e = trajectory_errors(*pose_arrays(trajectory), shot.rotations, shot.centers)
+        errors[name] = e.ate, e.t_rpe, e.r_rpe
+    extent = float(np.linalg.norm(shot.centers - shot.centers[0], axis=1).max())
+    return Measured(shot.name, np.array(latency), seconds, errors, _inside(updates, shot), extent)
+
+
+def _inside(updates: Sequence[FrameUpdate], shot: Shot) -> NDArray[np.bool_]:
+    """Poses relative to the first camera, with the one scale that is free, against their covariance."""
+    rotations, centers = pose_arrays([update.cam_from_world for update in updates])
+    rotations, centers = _relative(rotations, centers)
+    true_rotations, true_centers = _relative(shot.rotations, shot.centers)
+    settled = slice(len(centers) // 3, None)
+    scale = np.nansum(centers[settled] * true_centers[settled]) / np.nansum(true_centers[settled] ** 2)
+    inside = []
+    for k, update in list(enumerate(updates))[1:]:
+        if update.covariance is None:
+            inside.append(False)
+            continue
+        turn = cv2.Rodrigues(rotations[k].T @ true_rotations[k])[0].ravel()
+        move = rotations[k].T @ (scale * true_centers[k] - centers[k])
+        parts = ((turn, update.covariance[:3, :3]), (move, update.covariance[3:, 3:]))
+        inside.append(all(error @ np.linalg.solve(c, error) < _SIGMAS**2 for error, c in parts))
+    return np.array(inside)
+
+
+def _relative(rotations: Array, centers: Array) -> tuple[Array, Array]:
+    return np.einsum("ji,njk->nik", rotations[0], rotations), (centers - centers[0]) @ rotations[0]
+
+
+def speed_table(runs: Sequence[Measured]) -> str:
+    rows: list[list[object]] = []
+    for run in runs:
+        quantiles = [f"{1e3 * np.quantile(run.latency, q):.0f}" for q in (0.5, 0.95, 0.99)]
+        rows.append([run.name, f"{len(run.latency) / run.seconds:.1f}", *quantiles])
+    pooled = np.concatenate([run.latency for run in runs])
+    total = sum(run.seconds for run in runs)
+    quantiles = [f"{1e3 * np.quantile(pooled, q):.0f}" for q in (0.5, 0.95, 0.99)]
+    rows.append(["all", f"{len(pooled) / total:.1f}", *quantiles])
+    return table(["shot", "frames per second", "push, median ms", "95 %", "99 %"], rows)
+
+
+def accuracy_table(runs: Sequence[Measured]) -> str:
+    rows: list[list[object]] = []
+    for name in runs[0].errors:
+        pooled = dict(
+            zip(
+                ("ATE", "T-RPE", "R-RPE"),
+                map(np.concatenate, zip(*(r.errors[name] for r in runs), strict=True)),
+                strict=True,
+            )
+        )
+        rows.append([name, *(f"{auc(pooled[kind], threshold):.1f}" for kind, threshold in _COLUMNS)])
+    return table(["poses", *_HEADER], rows)
+
+
+def shot_table(runs: Sequence[Measured]) -> str:
+    rows: list[list[object]] = []
+    for run in runs:
+        ate = {name: float(np.median(errors[0])) for name, errors in run.errors.items()}
+        rows.append(
+            [
+                run.name,
+                *(f"{1e3 * value:.2f}" for value in ate.values()),
+                f"{100.0 * ate['as given'] / run.extent:.2f}",
+                f"{ate['graph'] / ate['polished']:.2f}",
+                f"{100.0 * run.inside.mean():.1f}",
+            ]
+        )
+    header = ["shot", *(f"median ATE {name}, mm" for name in runs[0].errors)]
+    return table([*header, "as given, % of the path", "graph / polished", "truth in 5 sigma, %"], rows)
+
+
+def long_stream(count: int) -> str:
+    """A rendered move back and forth, again and again: cost per frame, memory, and drift."""
+    shot = render_shot("truck", 60, 960, 540)
+    stream = Stream(shot.camera)
+    latency: list[float] = []
+    memory: dict[int, float] = {}
+    updates = []
+    for k, frame in enumerate(islice(_back_and_forth(shot), count)):
+        start = time.perf_counter()
+        updates.append(stream.push(frame))
+        latency.append(time.perf_counter() - start)
+        if k in (_WARM_UP, count - 1):
+            memory[k] = _resident_mb()
+    early, late = np.mean(latency[200:700]), np.mean(latency[-500:])
+    order = [k for k, _ in zip(_turns(len(shot.images)), range(count), strict=False)]
+    truth = [shot.cam_from_world[k] for k in order]
+    errors = trajectory_errors(*pose_arrays([update.cam_from_world for update in updates]), *pose_arrays(truth))
+    path = float(np.linalg.norm(np.ptp(pose_arrays(truth)[1], axis=0)))
+    halves = np.nanmedian(errors.ate[200:700]), np.nanmedian(errors.ate[-500:])
+    stream.close()
+    rows: list[list[object]] = [
+        ["frames", count],
+        ["registered", sum(update.cam_from_world is not None for update in updates)],
+        ["ms per frame, frames 200 to 700", f"{1e3 * early:.1f}"],
+        ["ms per frame, the last 500", f"{1e3 * late:.1f}"],
+        ["ratio", f"{late / early:.2f}"],
+        [f"resident memory after frame {_WARM_UP}, MB", f"{memory[_WARM_UP]:.0f}"],
+        ["resident memory at the end, MB", f"{memory[count - 1]:.0f}"],
+        ["median ATE of frames 200 to 700, % of the path", f"{100 * halves[0] / path:.3f}"],
+        ["median ATE of the last 500 frames, % of the path", f"{100 * halves[1] / path:.3f}"],
+    ]
+    return table(["a move back and forth", ""], rows)
+
+
+def _turns(frames: int) -> Iterator[int]:
+    while True:
+        yield from range(frames)
+        yield from range(frames - 2, 0, -1)
+
+
+def _back_and_forth(shot: RenderedShot) -> Iterator[Frame]:
+    for number, k in enumerate(_turns(len(shot.images))):
+        yield Frame(number, shot.images[k], f"{number:06d}")
+
+
+def _resident_mb() -> float:
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize() / 2**20
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.live", description=__doc__)
+    parser.add_argument("--data", type=Path, required=True, help="folder of the sets")
+    parser.add_argument("--models", type=Path, help="folder of the networks (default: models beside the data)")
+    parser.add_argument("--shots", nargs="+", default=STUDIO, metavar="NAME", help="only these")
+    parser.add_argument("--long", type=int, default=3000, metavar="FRAMES", help="length of the long stream, 0: none")
+    parser.add_argument("--output", type=Path, default=HERE / "results", help="folder of LIVE.md")
+    arguments = parser.parse_args()
+    models = arguments.models or arguments.data.parent / "models"
+    load = os.getloadavg()[0]
+    runs = []
+    for name in arguments.shots:
+        runs.append(measure(open_shot(arguments.data, name, FULL), arguments.data, models, HERE / "cache"))
+        print(shot_table(runs[-1:]), speed_table(runs[-1:]), sep="\n", flush=True)
+    parts = [
+        "# Live",
+        f"Generated by `python -m benchmarks.live`. Machine: {machine()}; load at the start {load:.1f}.",
+        "TCMonoDepth at the keyframes, known lens; decoding, masks, tracking, network and graph included.",
+        "## Speed",
+        speed_table(runs),
+        "## Accuracy",
+        "Area under the recall curve in percent, pooled over all frames: poses as they were given at the time, as the "
+        "graph knows them at the last frame, and after the polish.",
+        accuracy_table(runs),
+        shot_table(runs),
+    ]
+    if arguments.long:
+        parts += ["## A long stream", long_stream(arguments.long)]
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    (arguments.output / "LIVE.md").write_text("\n\n".join(parts) + "\n")
+    latency = {run.name: run.latency.tolist() for run in runs}
+    (arguments.output / "live.json").write_text(json.dumps({"latency": latency}))
+    print("\n\n".join(parts))
+
+
+if __name__ == "__main__":
+    main()
