@@ -21,6 +21,7 @@ class FrameStatus(StrEnum):
     TOO_FEW_INLIERS = "too_few_inliers"
     BLANK = "blank"  # black, white or blurred: no texture to track
     WAITING = "waiting"  # not yet initialised
+    UNUSABLE = "unusable"  # of an image set: unreadable, or from another camera
 
 
 class ShotKind(StrEnum):
