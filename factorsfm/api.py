@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import tempfile
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,11 +16,13 @@ from numpy.typing import NDArray
 from factorsfm.camera import guess_camera
 from factorsfm.errors import InputError
 from factorsfm.frames import Frame, read_frames
+from factorsfm.image_set import ImageSet
 from factorsfm.options import Options
 from factorsfm.priors.depth import DepthFolder, DepthKind, DepthPrior, open_depth
 from factorsfm.priors.masks import MaskFolder, MaskPrior, open_masks
 from factorsfm.reconstruction import Reconstruction
 from factorsfm.stream import Stream
+from factorsfm.unordered import looks_unordered, other_files, read_images
 
 Progress = Callable[[str, int, int | None], None]
 
@@ -32,9 +36,11 @@ def reconstruct(
     masks: str | Path | MaskPrior | None = None,
     frames: slice | None = None,
     preset: str = "default",
+    unordered: bool | None = None,
+    work: str | Path | None = None,
     progress: Progress | None = None,
 ) -> Reconstruction:
-    """Camera path, lens and sparse points of one shot.
+    """Camera path, lens and sparse points of one shot, or of a set of photographs.
 
     Args:
         source: a video file, a folder of images, or any iterable of 8-bit images (BGR or grey) or `Frame`s.
@@ -44,6 +50,9 @@ def reconstruct(
         masks: a folder, a segmentation network, any `MaskPrior`, or None.
         frames: range of the source's frames.
         preset: see `options.PRESETS`.
+        unordered: whether the images are a set in any order, which are matched with each other, or a shot, which is
+            tracked from frame to frame; None decides for folders by `unordered.looks_unordered`.
+        work: folder for the features and matches of a set, from which an interrupted run goes on; None keeps nothing.
         progress: called with the stage, the frames done, and their number where it is known.
 
     Raises:
@@ -54,6 +63,27 @@ def reconstruct(
     options = Options.preset_named(preset)
     prior = open_depth(depth, depth_kind) if options.uses_depth else None
     mask_prior = open_masks(masks)
+    if unordered is None:
+        unordered = isinstance(source, str | Path) and looks_unordered(Path(source), frames)
+    if unordered:
+        result = _from_images(source, frames, camera, prior, mask_prior, options, work, progress)
+    else:
+        result = _from_shot(source, frames, camera, prior, mask_prior, options, progress)
+    result.seconds["total"] = time.perf_counter() - begin
+    result.options["source"] = str(source) if isinstance(source, str | Path) else "frames"
+    result.options["unordered"] = unordered
+    return result
+
+
+def _from_shot(
+    source: str | Path | Iterable[Frame | NDArray[np.uint8]],
+    frames: slice | None,
+    camera: pycolmap.Camera | None,
+    depth: DepthPrior | None,
+    masks: MaskPrior | None,
+    options: Options,
+    progress: Progress | None,
+) -> Reconstruction:
     iterator = read_frames(source, frames)
     if camera is None:
         options = replace(options, refine_focal_length=True)
@@ -62,19 +92,56 @@ def reconstruct(
         if stream is None:
             if camera is None:
                 camera = _guessed_camera(source, frame)
-            stream = Stream(camera, depth=prior, masks=mask_prior, options=options)
+            stream = Stream(camera, depth=depth, masks=masks, options=options)
         if progress is not None:
             progress("frames", done, None)
         stream.push(frame)
     if stream is None:
         raise InputError(f"no frames in {source}")
-    for name, folder in (("depth map", prior), ("mask", mask_prior)):
+    _check_matched(source, depth, masks)
+    return stream.finish(progress)
+
+
+def _from_images(
+    source: str | Path | Iterable[Frame | NDArray[np.uint8]],
+    frames: slice | None,
+    camera: pycolmap.Camera | None,
+    depth: DepthPrior | None,
+    masks: MaskPrior | None,
+    options: Options,
+    work: str | Path | None,
+    progress: Progress | None,
+) -> Reconstruction:
+    with _work_folder(work) as folder:
+        images = ImageSet(folder, camera, depth=depth, masks=masks, options=options)
+        if isinstance(source, str | Path) and (others := other_files(Path(source))):
+            images.note(f"{len(others)} files that are no images were ignored: {', '.join(others[:5])}.")
+        for done, image in enumerate(read_images(source, frames)):
+            if progress is not None:
+                progress("images", done, None)
+            if isinstance(image, Frame):
+                path = Path(source) / image.name if isinstance(source, str | Path) and Path(source).is_dir() else None
+                images.add(image, path)
+            else:
+                images.leave_out(image.index, image.name, image.reason)
+        result = images.finish(progress)
+        _check_matched(source, depth, masks)
+        return result
+
+
+@contextmanager
+def _work_folder(work: str | Path | None) -> Iterator[Path]:
+    if work is not None:
+        yield Path(work)
+        return
+    with tempfile.TemporaryDirectory(prefix="factorsfm-") as folder:
+        yield Path(folder)
+
+
+def _check_matched(source: object, depth: DepthPrior | None, masks: MaskPrior | None) -> None:
+    for name, folder in (("depth map", depth), ("mask", masks)):
         if isinstance(folder, DepthFolder | MaskFolder) and folder.asked and not folder.matched:
             raise InputError(f"no {name} in the given folder matches a frame of {source}")
-    result = stream.finish(progress)
-    result.seconds["total"] = time.perf_counter() - begin
-    result.options["source"] = str(source) if isinstance(source, str | Path) else "frames"
-    return result
 
 
 def _guessed_camera(source: object, frame: Frame) -> pycolmap.Camera:

@@ -65,6 +65,8 @@ def _reconstruct(arguments: argparse.Namespace, progress: _Progress) -> None:
             masks=_unless_none(arguments.masks),
             frames=frames,
             preset=arguments.preset,
+            unordered=arguments.unordered or None,
+            work=arguments.work,
             progress=progress,
         )
     except ReconstructionError as error:
@@ -191,6 +193,17 @@ def _parser() -> argparse.ArgumentParser:
     )
     reconstruct.add_argument("--frames", metavar="START:STOP[:STEP]", help="counted from 0, without STOP")
     reconstruct.add_argument("--preset", choices=list(PRESETS), default="default", help="default: %(default)s")
+    reconstruct.add_argument(
+        "--unordered",
+        action="store_true",
+        help="match the images of a folder with each other, in any order; by itself where they are hardly a shot",
+    )
+    reconstruct.add_argument(
+        "--work",
+        type=Path,
+        metavar="DIR",
+        help="keep features and matches of an unordered set here: an interrupted run goes on from them",
+    )
 
     demo_command = commands.add_parser(
         "demo",

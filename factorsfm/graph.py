@@ -81,7 +81,8 @@ class FactorGraph:
             adjustment.solve(iterations, trial.step)
             covariance = {p: np.asarray(trial.isam.marginalCovariance(X(p))) for _, p in free}
         except Exception as error:  # gtsam raises several types; any of them leaves the trial unusable
-            reason = f"the linear system of the update is indeterminate ({str(error).strip().splitlines()[0]})"
+            message = (str(error).strip() or repr(error)).splitlines()[0]
+            reason = f"the linear system of the update is indeterminate ({message})"
         else:
             reason = _fault(adjustment)
         if reason:

@@ -28,7 +28,6 @@ _FIRST_SIGMA_PX = 0.25
 _SMALLEST_SIGMA_PX = 0.03
 _RAYLEIGH_MEDIAN = 1.1774  # median of the norm of a 2-D error, in standard deviations
 _DOUBTFUL_INFLATION = 3.0  # sound solutions have 1 to 2
-_DOUBTFUL_SIGMA_PX = 0.2  # sound solutions have 0.04 to 0.15, also of degraded footage
 _CORE_TRACKS = 400  # tracks with which the cameras converge first
 _TRIANGULATION_VIEWS = 10
 # Relative standard deviation up to which a focal length counts as determined. It knows nothing of systematic tracking
@@ -102,7 +101,11 @@ def polish(
     sigma = adjustment.sigma
     state = _with_part(state, part, core)
     state = BundleAdjustment(state, observations, replace(o, iterations=4), sigma=sigma, points_only=True).solve()
-    observations, tracks, state = _without_outliers(state, observations, tracks, sigma, o)
+    if o.observation_sigmas is None:
+        observations, tracks, state = _without_outliers(state, observations, tracks, sigma, o)
+    else:
+        limit = o.observation_sigmas * sigma
+        observations, tracks, state = _without_outlying_observations(state, observations, tracks, limit, o)
     progress("polish: all tracks")
     prior = None
     # Pixel errors that repeat themselves from frame to frame weigh less; the kernel keeps its width in pixels.
@@ -158,26 +161,29 @@ def _first_guess(
     distance = np.linalg.norm(points, axis=1)
     unit = float(np.median(1.0 / np.maximum(distance, 1e-6)))
     translation = translation * unit
-    views = np.unique(np.linspace(0, len(images) - 1, _TRIANGULATION_VIEWS).astype(int))
-    few = np.isin(observations.frame, views)
-    first_of_track = np.zeros(len(few), bool)
-    first_of_track[np.searchsorted(observations.point, np.arange(len(tracks)))] = True
-    keep = few | first_of_track
-    some = Observations(observations.frame[keep], observations.point[keep], observations.xy[keep])
-    result = triangulate(
-        turn,
-        translation,
-        some,
-        focal=focal,
-        inlier_px=5.0,
-        sigma=_FIRST_SIGMA_PX,
-        fallback=np.ones(len(tracks)),
-    )
-    bearing, inverse = result.bearing.copy(), result.inverse_distance.copy()
     mapped = np.isin(tracks, ids)
     at = np.searchsorted(ids, tracks[mapped])
+    bearing, inverse = np.empty((len(tracks), 3)), np.empty(len(tracks))
     bearing[mapped] = points[at] / distance[at, None]
     inverse[mapped] = 1.0 / np.maximum(distance[at] * unit, 1e-3)
+    if not mapped.all():
+        views = np.unique(np.linspace(0, len(images) - 1, _TRIANGULATION_VIEWS).astype(int))
+        few = np.isin(observations.frame, views)
+        first_of_track = np.zeros(len(few), bool)
+        first_of_track[np.searchsorted(observations.point, np.arange(len(tracks)))] = True
+        keep = few | first_of_track
+        some = Observations(observations.frame[keep], observations.point[keep], observations.xy[keep])
+        new = np.nonzero(~mapped)[0]
+        result = triangulate(
+            turn,
+            translation,
+            _subset(some, new),
+            focal=focal,
+            inlier_px=5.0,
+            sigma=_FIRST_SIGMA_PX,
+            fallback=np.ones(len(new)),
+        )
+        bearing[new], inverse[new] = result.bearing, result.inverse_distance
     inverse = np.clip(inverse, 0.02, 20.0)
     return State(turn, translation, bearing, inverse, float(np.log(focal)))
 
@@ -223,7 +229,7 @@ def _converge_cameras(
     few = _subset(observations, core)
     part = replace(state, bearing=state.bearing[core], inverse_distance=state.inverse_distance[core])
     best = _solve_core(part, few, options)
-    if best.sigma > _DOUBTFUL_SIGMA_PX or _temporal_inflation(best, few) > _DOUBTFUL_INFLATION:
+    if best.sigma > options.polish.doubtful_px or _temporal_inflation(best, few) > _DOUBTFUL_INFLATION:
         logger.info("the solution does not fit (%.2f px), trying other starts", best.sigma)
         best = min(best, _solve_core(_flat(part, few, options.polish), few, options), key=lambda b: b.sigma)
         best = min(best, _solve_core(_reversed(best.state), few, options), key=lambda b: b.sigma)
@@ -283,6 +289,18 @@ def _without_outliers(
     keep = np.nonzero(typical < center + options.outlier_sigmas * max(spread, 0.1))[0]
     state = replace(state, bearing=state.bearing[keep], inverse_distance=state.inverse_distance[keep])
     return _subset(observations, keep), tracks[keep], state
+
+
+def _without_outlying_observations(
+    state: State, observations: Observations, tracks: Index, limit_px: float, options: PolishOptions
+) -> tuple[Observations, Index, State]:
+    """Drop wrong matches one by one, and tracks of which less than two observations remain."""
+    good = BundleAdjustment(state, observations, options, sigma=1.0).reprojection_errors() < limit_px
+    good &= np.bincount(observations.point, good, len(tracks))[observations.point] >= 2
+    keep = np.unique(observations.point[good])
+    state = replace(state, bearing=state.bearing[keep], inverse_distance=state.inverse_distance[keep])
+    o = observations
+    return _subset(Observations(o.frame[good], o.point[good], o.xy[good]), keep), tracks[keep], state
 
 
 def _checked_focal(

@@ -22,6 +22,7 @@ class FrameStatus(StrEnum):
     LOST = "lost"  # what the image shows is not in the map
     BLANK = "blank"  # black, white or blurred: no texture to track
     WAITING = "waiting"  # not yet initialised
+    UNUSABLE = "unusable"  # of an image set: unreadable, or from another camera
 
 
 class ShotKind(StrEnum):

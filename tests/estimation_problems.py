@@ -6,7 +6,10 @@ import numpy as np
 import pycolmap
 
 from factorsfm.camera import normalized_from_pixels
+from factorsfm.images import ImageTracks, MappedImage
 from factorsfm.problem import Observations, State
+from factorsfm.reconstruction import FrameStatus
+from factorsfm.registration import ImageDepth
 from factorsfm.synthetic import synthetic_scene
 
 
@@ -57,6 +60,24 @@ def make_problem(motion, *, frames=10, points=100, parallax=0.05, noise_px=0.0, 
     )
     observations = Observations(np.tile(np.arange(frames), n), np.repeat(np.arange(n), frames), xy.reshape(-1, 2))
     return Problem(truth, points, observations, focal, noise_px)
+
+
+def image_depth(problem, frame, ids, *, scale=1.0, shift=0.0, noise=0.0, seed=0):
+    """A prior at some points of a frame: ``scale / z + shift`` and noise, everywhere reliable."""
+    value = scale / problem.depth(frame, ids) + shift
+    value = value + noise * np.random.default_rng([seed, frame]).standard_normal(len(ids))
+    return ImageDepth(value, np.ones(len(ids)), unit=1.0)
+
+
+def mapped_images(problem, state, *, guided=(), **prior):
+    """The frames as the mapper sees them, at the poses of `state`; `guided` ones carry a prior (see `image_depth`)."""
+    images = []
+    for k in range(problem.frames):
+        ids, xy = problem.of_frame(k)
+        depth = image_depth(problem, k, ids, **prior) if k in guided else None
+        tracks = ImageTracks(k, ids, xy, depth)
+        images.append(MappedImage(tracks, FrameStatus.REGISTERED, "", state.rotation[k], state.translation[k]))
+    return images
 
 
 def rotation_matrices(vectors):

@@ -63,6 +63,8 @@ def test_reconstruct_writes_the_result(
         "masks": None,
         "frames": None,
         "preset": "default",
+        "unordered": None,
+        "work": None,
     }
     captured = capsys.readouterr()
     assert captured.err == ""  # no progress where stderr is no terminal
