@@ -22,13 +22,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.inputs import VARIANTS, open_frames, open_prior, open_shot
-from benchmarks.plan import COLMAP, Cell
+from benchmarks.plan import AS_SET, COLMAP, UNORDERED, Cell
 from benchmarks.store import Record, cell_key, record_path, save
 from factorsfm import MaskFolder, Options, Reconstruction, Stream
 from factorsfm.evaluation import baselines
 from factorsfm.evaluation.alignment import pose_arrays
 from factorsfm.evaluation.metrics import DepthErrors, parallax, point_depth_errors, trajectory_errors
 from factorsfm.evaluation.truth import Shot
+from factorsfm.image_set import ImageSet
 
 Array = NDArray[np.float64]
 
@@ -136,10 +137,17 @@ def _factorsfm(cell: Cell, shot: Shot, folders: Folders) -> Estimate:
     begin = time.perf_counter()
     masks = MaskFolder(shot.masks) if shot.masks is not None else None
     depth = open_prior(cell.prior, shot, folders.data, folders.models, folders.cache)
-    stream = Stream(shot.camera, depth=depth, masks=masks, options=options)
-    for frame in frames:
-        stream.push(frame)
-    result = stream.finish()
+    if cell.shot in UNORDERED or cell.variant == AS_SET:
+        with tempfile.TemporaryDirectory(prefix="matches-") as folder:
+            images = ImageSet(Path(folder), shot.camera, depth=depth, masks=masks, options=options)
+            for frame in frames:
+                images.add(frame)
+            result = images.finish()
+    else:
+        stream = Stream(shot.camera, depth=depth, masks=masks, options=options)
+        for frame in frames:
+            stream.push(frame)
+        result = stream.finish()
     with tempfile.TemporaryDirectory(prefix="result-") as folder:
         start = time.perf_counter()
         result.write(Path(folder) / "result")

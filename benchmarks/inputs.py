@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.plan import CRF_30, DEGRADED, FEW, FIRST_10, FIRST_20, FULL, NO_PRIOR
+from benchmarks.plan import AS_SET, CRF_30, DEGRADED, FEW, FIRST_10, FIRST_20, FULL, NO_PRIOR
 from factorsfm import DepthFolder, DepthKind, DepthMap, DepthModel, DepthPrior, Frame, InputError
 from factorsfm.evaluation.degrade import degraded_frames
 from factorsfm.evaluation.readers import read_shot
@@ -48,6 +48,7 @@ VARIANTS = {
     FEW: Variant(max_tracks=40),
     DEGRADED: Variant(frames=30),
     CRF_30: Variant(frames=30),
+    AS_SET: Variant(),
 }
 
 

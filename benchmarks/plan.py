@@ -30,6 +30,7 @@ USELESS = ("image-row", "random-field")
 NOISE = ("noise-0", "noise-0.1", "noise-0.2", "noise-0.4")
 
 FULL, FIRST_10, FIRST_20, FEW, DEGRADED, CRF_30 = "full", "first-10", "first-20", "tracks-40", "degraded", "crf-30"
+AS_SET = "as-set"  # the frames as an unordered set
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,8 +76,9 @@ _THREE = ("default", "paper", "geometry")
 EXPERIMENTS: dict[str, list[Cell]] = {
     "pose": _cells(STUDIO, ("default", *PAPER, "geometry", *COLMAP), _BOTH),
     "real": _cells(REAL, (*_THREE, *COLMAP), ("tcmonodepth",)),
-    # The methods for unordered images join here when there are any.
-    "wide": _cells(WIDE_VIDEO, ("default", "geometry"), ("tcmonodepth",)) + _cells((*UNORDERED, *WIDE_VIDEO), COLMAP),
+    "wide": _cells((*UNORDERED, *WIDE_VIDEO), ("default", "geometry", *COLMAP), ("tcmonodepth",)),
+    "sets": _cells((*WIDE_VIDEO, *KITCHEN), ("default", "geometry"), ("tcmonodepth",), (AS_SET,))
+    + _cells((*WIDE_VIDEO, *KITCHEN), COLMAP),
     "edge": _cells(EDGE, (*_THREE, *COLMAP), ("tcmonodepth",)),
     "short": _cells(STUDIO, (*_THREE, "colmap_tuned"), _BOTH, (FIRST_10,))
     + _cells(KITCHEN, (*_THREE, "colmap_tuned"), ("tcmonodepth",), (FIRST_10,)),

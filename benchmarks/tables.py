@@ -215,6 +215,7 @@ SECTIONS: Mapping[str, tuple[str, Callable[[Records, Path], list[str]]]] = {
     "pose": ("Camera path on shots with little parallax", _pose),
     "real": ("Real and other clips", _real),
     "wide": ("Wide baseline", _real),
+    "sets": ("Frames of shots as unordered sets", _real),
     "edge": ("Rotation only, and no motion", _edge),
     "short": ("The first 10 frames", _split),
     "few": ("At most 40 tracks", _pooled),

@@ -133,7 +133,10 @@ class SetMapper:
     # --- start --------------------------------------------------------------------------------------------------
 
     def _starts(self, usable: list[int]) -> list[Start]:
-        """Possible starts, the best one first: two-view geometry where parallax supports it, else the prior."""
+        """Possible starts, the best one first: two-view geometry where parallax supports it, else the prior.
+
+        With the start "pair" of the options, the paper's, the prior always comes first.
+        """
         o = self.options
         tracks = [i.tracks for i in self.images]
         found: list[tuple[float, Start]] = []
@@ -149,7 +152,7 @@ class SetMapper:
             logger.debug("start from images %d and %d: %d points at %.1f degrees", a, b, len(start.ids), angle)
             found.append((len(start.ids) * min(angle, _WIDE_ENOUGH_DEG), start))
         starts = [start for _, start in sorted(found, key=lambda f: -f[0])]
-        if not starts or _median_angle(starts[0]) < _GEOMETRIC_DEG:
+        if o.initialization == "pair" or not starts or _median_angle(starts[0]) < _GEOMETRIC_DEG:
             lifted = self._start_from_depth(usable)
             if isinstance(lifted, Start):
                 starts.insert(0, lifted)
