@@ -79,6 +79,7 @@ class FactorGraph:
         before = adjustment.state
         try:
             adjustment.solve(iterations, trial.step)
+            trial.step(adjustment.state, *adjustment.condensed())  # the covariances are those without damping
             covariance = {p: np.asarray(trial.isam.marginalCovariance(X(p))) for _, p in free}
         except Exception as error:  # gtsam raises several types; any of them leaves the trial unusable
             message = (str(error).strip() or repr(error)).splitlines()[0]

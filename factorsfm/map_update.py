@@ -34,7 +34,7 @@ _YOUNG_ITERATIONS = 40  # divided by the number of keyframes
 _SOLVER = replace(PolishOptions(), tolerance=1e-4)
 _RAYLEIGH_MEDIAN = 1.1774
 _LARGEST_SIGMA_PX = 3.0
-_ALIKE = 10.0  # tracks that count as one: the errors of neighbours are alike
+_ALIKE = 20.0  # tracks that count as one: the errors of neighbours are alike
 _FARTHEST = 1e-6  # smallest inverse distance of a point
 
 

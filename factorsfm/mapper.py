@@ -364,7 +364,8 @@ class Mapper:
         image = self.images[update.position]
         if image.tracks.depth is None and update.depth is not None:
             image.tracks = replace(image.tracks, depth=update.depth)
-        if self._uses_keyframe_depth and update.depth is None and self._waits_for_depth < _DEPTH_PATIENCE:
+        missing = self._uses_keyframe_depth and update.depth is None
+        if missing and self.keyframes and self._waits_for_depth < _DEPTH_PATIENCE:
             self._waits_for_depth += 1  # another image may have a map
             image.keyframe = False
             return

@@ -38,7 +38,7 @@ class PointMap:
 
     def remove(self, ids: Index) -> None:
         """Forget the positions of some tracks."""
-        self._points[ids] = np.nan
+        self._points[ids[ids < len(self._points)]] = np.nan
 
     def copy(self) -> PointMap:
         """An independent copy."""

@@ -325,6 +325,12 @@ class BundleAdjustment:
             gradient[columns] -= cross @ step.ravel()
         return information, gradient, point_covariance
 
+    def condensed(self) -> tuple[Array, Array]:
+        """Information matrix and gradient of the free camera side at the present state, the points eliminated."""
+        normal = self._linearize()
+        information, gradient, _ = self._reduced(normal, self._cross_blocks(normal), 0.0)
+        return _conditioned(information[np.ix_(self._free, self._free)]), gradient[self._free]
+
     def _step(
         self, normal: _Normal, blocks: list[tuple[Array, Index, slice]], damping: float, solve_cameras: CameraSolver
     ) -> tuple[Array, Array]:
