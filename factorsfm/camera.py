@@ -121,6 +121,17 @@ def pixels_from_normalized(camera: pycolmap.Camera, uv: NDArray[np.float64]) -> 
     return np.asarray(camera.img_from_cam(rays), dtype=np.float64) - PIXEL_CENTER
 
 
+def with_focal(camera: pycolmap.Camera, focal: float) -> pycolmap.Camera:
+    """The same camera with another mean focal length (pixels)."""
+    estimated = pycolmap.Camera(camera.todict())
+    ratio = focal / (0.5 * (camera.focal_length_x + camera.focal_length_y))
+    for index in camera.focal_length_idxs():
+        params = estimated.params
+        params[index] *= ratio
+        estimated.params = params
+    return estimated
+
+
 def camera_from_json(content: Mapping[str, Any]) -> pycolmap.Camera:
     """A camera from the content of a camera file; errors as in `read_camera`."""
     width, height = (_size(content, key) for key in ("width", "height"))

@@ -35,6 +35,10 @@ _SOLVER = replace(PolishOptions(), tolerance=1e-4)
 _RAYLEIGH_MEDIAN = 1.1774
 _LARGEST_SIGMA_PX = 3.0
 _ALIKE = 20.0  # tracks that count as one: the errors of neighbours are alike
+_LENS_KEYFRAMES = 6  # from which an unknown focal length is estimated
+_LENS_ITERATIONS = 6
+_LENS_STD = 0.03  # relative, with which an estimate is better than a guess
+_LARGEST_LENS_STEP = 0.5  # of the logarithm of the focal length
 _FARTHEST = 1e-6  # smallest inverse distance of a point
 
 
@@ -48,6 +52,7 @@ class MapUpdate:
         ids, points: moved and new points; removed: points that no longer hold.
         poses, affines, covariances: of the keyframes that moved, by position.
         outliers: tracks of the new keyframe whose point is elsewhere.
+        focal: a better focal length (pixels), None where it stays as it is.
     """
 
     position: int
@@ -61,6 +66,7 @@ class MapUpdate:
     affines: dict[int, tuple[float, float]] = field(default_factory=dict)
     covariances: dict[int, Array] = field(default_factory=dict)
     outliers: Index = field(default_factory=lambda: np.zeros(0, np.int64))
+    focal: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,13 +75,14 @@ class MapCopy:
 
     Attributes:
         keyframes: in order of time, the new one last.
-        focal: pixels.
+        focal: pixels; refine_focal: whether it is a guess.
     """
 
     keyframes: list[MappedImage]
     points: PointMap
     options: MapperOptions
     focal: float
+    refine_focal: bool = False
 
 
 def update_map(copy: MapCopy, graph: FactorGraph, read_depth: Callable[[], ImageDepth | None] | None) -> MapUpdate:
@@ -104,7 +111,23 @@ def update_map(copy: MapCopy, graph: FactorGraph, read_depth: Callable[[], Image
     result = graph.update(adjustment, positions, held.tolist(), guided, iterations)
     if not result.committed:
         return MapUpdate(position, depth, False, result.reason)
-    return _judged(copy, adjustment, window, held, ids, guided, result)
+    focal = _better_focal(adjustment, held) if copy.refine_focal and len(copy.keyframes) >= _LENS_KEYFRAMES else None
+    return _judged(copy, adjustment, window, held, ids, guided, result, focal)
+
+
+def _better_focal(adjustment: BundleAdjustment, held: NDArray[np.bool_]) -> float | None:
+    """Solve for the focal length, too; None where the map does not determine it yet."""
+    free = BundleAdjustment(
+        adjustment.state, adjustment.observations, _SOLVER,
+        sigma=adjustment.sigma, free_focal=True, fixed=held, prior=adjustment.prior,
+    )  # fmt: skip
+    state = free.solve(_LENS_ITERATIONS)
+    covariance, _ = free.covariance(np.zeros(0, np.int64))
+    variance = _ALIKE * covariance[6 * len(held), 6 * len(held)]
+    if variance > _LENS_STD**2 or abs(state.log_focal - adjustment.state.log_focal) > _LARGEST_LENS_STEP:
+        return None
+    adjustment.state = state
+    return float(np.exp(state.log_focal))
 
 
 def _window(keyframes: list[MappedImage]) -> tuple[list[MappedImage], NDArray[np.bool_]]:
@@ -182,6 +205,7 @@ def _judged(
     ids: Index,
     guided: list[int],
     result: UpdateResult,
+    focal: float | None,
 ) -> MapUpdate:
     """The solution as the map takes it over, and what in it does not fit."""
     state, o = adjustment.state, adjustment.observations
@@ -202,7 +226,7 @@ def _judged(
     newest = (o.frame == len(window) - 1) & (errors > limit)
     return MapUpdate(
         window[-1].tracks.position, window[-1].tracks.depth, True, result.reason,
-        ids[good], unit * state.points[good], ids[~good], poses, affines, covariances, ids[o.point[newest]],
+        ids[good], unit * state.points[good], ids[~good], poses, affines, covariances, ids[o.point[newest]], focal,
     )  # fmt: skip
 
 

@@ -50,6 +50,7 @@ class Mapper:
         self.options = options.mapper
         self.focal = focal
         self.width = width
+        self._refine_focal = options.refine_focal_length
         self.images: list[MappedImage] = []
         self.keyframes: list[int] = []
         self.outliers = np.zeros(0, np.int64)  # tracks that the last image showed to be wrong
@@ -59,6 +60,7 @@ class Mapper:
         self._worker = ThreadPoolExecutor(1, "factorsfm-graph")
         self._update: Future[MapUpdate] | None = None
         self._due = 0
+        self._advanced = -1  # number of images for which `advance` was called last
         self._start_kind = self.options.initialization if has_prior else "essential"
         self._reads_every_depth = has_prior and (
             self._start_kind == "pair" or self.options.registration_depth != "none"
@@ -100,10 +102,7 @@ class Mapper:
         """
         if self._reads_every_depth:
             tracks = replace(tracks, depth=read_depth())
-        self.outliers = np.zeros(0, np.int64)
-        self.new_points = 0
-        if self._update is not None and len(self.images) >= self._due:
-            self._take_over()
+        self.advance()
         image = MappedImage(tracks, FrameStatus.WAITING, "waiting for the start of the map")
         self.images.append(image)
         try:
@@ -112,6 +111,16 @@ class Mapper:
             self.images.pop()
             raise
         return image
+
+    def advance(self) -> None:
+        """Before the next image: take over what the graph has made of a keyframe, if that is due."""
+        if self._advanced == len(self.images):
+            return
+        self._advanced = len(self.images)
+        self.outliers = np.zeros(0, np.int64)
+        self.new_points = 0
+        if self._update is not None and len(self.images) >= self._due:
+            self._take_over()
 
     def _process(self, image: MappedImage, read_depth: Callable[[], ImageDepth | None]) -> None:
         if len(image.tracks.ids) < self.options.min_tracks:
@@ -349,7 +358,7 @@ class Mapper:
     def _add_keyframe(self, image: MappedImage, read_depth: Callable[[], ImageDepth | None] | None) -> None:
         """Let the graph work on the keyframe; the map takes over its result after `graph_delay` frames."""
         keyframes = [replace(self.images[k]) for k in self.keyframes] + [replace(image)]
-        copy = MapCopy(keyframes, self.points.copy(), self.options, self.focal)
+        copy = MapCopy(keyframes, self.points.copy(), self.options, self.focal, self._refine_focal)
         read = read_depth if self._uses_keyframe_depth else None
         self._update = self._worker.submit(update_map, copy, self.graph, read)
         image.keyframe = True
@@ -386,6 +395,14 @@ class Mapper:
             self.images[position].affine = affine
         self.outliers = update.outliers
         self._carry(update.position, before)
+        if update.focal is not None:
+            self._set_focal(update.focal)
+
+    def _set_focal(self, focal: float) -> None:
+        """Normalise all that was seen with another focal length."""
+        ratio, self.focal = self.focal / focal, focal
+        for image in self.images:
+            image.tracks = replace(image.tracks, xy=ratio * image.tracks.xy)
 
     def _carry(self, position: int, before: tuple[Array, Array]) -> None:
         """Move the images after a keyframe with it: they were registered on the map as it was before."""

@@ -8,6 +8,10 @@ from typing import Any, Literal
 
 from factorsfm.errors import InputError
 
+# Relative standard deviation up to which a focal length counts as determined. It knows nothing of systematic tracking
+# errors: on a dolly without rotation, 0.9 % stood beside an error of 12 %.
+FOCAL_STD = 0.005
+
 DepthUse = Literal["none", "paper", "inverse"]
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from factorsfm.images import MappedImage, gather
 from factorsfm.observability import Motion, classify_motion
-from factorsfm.options import Options, PolishOptions
+from factorsfm.options import FOCAL_STD, Options, PolishOptions
 from factorsfm.prior_term import PriorPart, joint_problem, weigh_prior
 from factorsfm.problem import Observations, State
 from factorsfm.reconstruction import ShotKind
@@ -30,9 +30,6 @@ _RAYLEIGH_MEDIAN = 1.1774  # median of the norm of a 2-D error, in standard devi
 _DOUBTFUL_INFLATION = 3.0  # sound solutions have 1 to 2
 _CORE_TRACKS = 400  # tracks with which the cameras converge first
 _TRIANGULATION_VIEWS = 10
-# Relative standard deviation up to which a focal length counts as determined. It knows nothing of systematic tracking
-# errors: on a dolly without rotation, 0.9 % stood beside an error of 12 %.
-FOCAL_STD = 0.005
 
 
 @dataclass(slots=True)

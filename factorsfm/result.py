@@ -9,8 +9,10 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from factorsfm.camera import with_focal
 from factorsfm.images import MappedImage
-from factorsfm.polish import FOCAL_STD, Polished
+from factorsfm.options import FOCAL_STD
+from factorsfm.polish import Polished
 from factorsfm.problem import State
 from factorsfm.reconstruction import FrameResult, FrameStatus, PriorFit, Reconstruction, ShotKind
 
@@ -58,7 +60,7 @@ def assemble(
     scale = _metric_scale(polished, images) if metric else None
     unit = scale or 1.0
     if focal_guessed:
-        camera = _with_focal(camera, float(np.exp(state.log_focal)))
+        camera = with_focal(camera, float(np.exp(state.log_focal)))
     kept, row_of = _usable_points(polished)
     observations = polished.observations
     keep = row_of[observations.point] >= 0
@@ -123,16 +125,6 @@ def _metric_scale(polished: Polished, images: list[MappedImage]) -> float | None
         return None
     units = [images[polished.frames[r]].tracks.depth.unit for r in polished.prior.images]  # type: ignore[union-attr]
     return 1.0 / float(np.median(polished.state.scale * np.array(units)))
-
-
-def _with_focal(camera: pycolmap.Camera, focal: float) -> pycolmap.Camera:
-    estimated = pycolmap.Camera(camera.todict())
-    ratio = focal / (0.5 * (camera.focal_length_x + camera.focal_length_y))
-    for index in camera.focal_length_idxs():
-        params = estimated.params
-        params[index] *= ratio
-        estimated.params = params
-    return estimated
 
 
 def _frame_results(

@@ -24,6 +24,7 @@ from factorsfm.camera import (
     guess_camera,
     normalized_from_pixels,
     pixels_from_normalized,
+    with_focal,
 )
 from factorsfm.errors import FactorsfmError, InputError, ModelError, ReconstructionError
 from factorsfm.frames import Frame, bgr_image
@@ -160,6 +161,7 @@ class Stream:
             tracked = self._tracker.track(frame.image, mask)
         self._remember_colors(frame.image, tracked.ids, tracked.xy)
         grey = cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY)
+        focal_changed = self._advance(mapper)
         xy = normalized_from_pixels(self.camera, tracked.xy)
         usable = np.isfinite(xy).all(axis=1)  # a distortion model may have no inverse in the corners
         usable &= tracked.texture >= _BLANK_TEXTURE  # what is tracked in a blank image is its noise
@@ -174,7 +176,7 @@ class Stream:
             self._keep_in_sight(image, grey, pixels)
         if image.status is not FrameStatus.WAITING:  # it may still take part in the start
             _mark_blank(image, tracked.texture)
-        return self._frame_update(frame, image)
+        return self._frame_update(frame, image, focal_changed)
 
     def trajectory(self) -> list[pycolmap.Rigid3d | None]:
         """`cam_from_world` of every frame so far as the graph knows it now, None where a frame is not registered.
@@ -320,12 +322,23 @@ class Stream:
         self._mapper = self._new_mapper()
         return self._mapper
 
+    def _advance(self, mapper: Mapper) -> bool:
+        """Take over what is due; whether the focal length is another one then."""
+        before = mapper.focal
+        with self._timed("mapping"):
+            mapper.advance()
+        if mapper.focal == before:
+            return False
+        assert self.camera is not None
+        self.camera = with_focal(self.camera, mapper.focal)
+        return True
+
     def _new_mapper(self) -> Mapper:
         assert self.camera is not None
         focal = 0.5 * (self.camera.focal_length_x + self.camera.focal_length_y)
         return Mapper(focal, self._size[0], self.options, has_prior=self._depth is not None)
 
-    def _frame_update(self, frame: Frame, image: MappedImage) -> FrameUpdate:
+    def _frame_update(self, frame: Frame, image: MappedImage, focal_changed: bool) -> FrameUpdate:
         mapper = self._mapper
         assert mapper is not None
         prior = None
@@ -339,7 +352,7 @@ class Stream:
         return FrameUpdate(
             frame.index, image.status, image.message, _pose(image), image.keyframe, len(image.tracks.ids), image.inliers,
             mapper.new_points, mapper.parallax, image.covariance, prior, frame.dropped,
-            focal_length=mapper.focal,
+            focal_length=mapper.focal, focal_changed=focal_changed,
         )  # fmt: skip
 
     def _failure(self, message: str) -> ReconstructionError:

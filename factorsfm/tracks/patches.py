@@ -95,7 +95,9 @@ class BirthPatches:
         room = (grey.shape[0] // tile) * (grey.shape[1] // tile)
         return in_parts(part, len(rows), room, pool)
 
-    def _align(self, grey: Image, rows: Rows, start: Array, check_px: float, reach_px: float) -> tuple[Array, NDArray[np.bool_]]:
+    def _align(
+        self, grey: Image, rows: Rows, start: Array, check_px: float, reach_px: float
+    ) -> tuple[Array, NDArray[np.bool_]]:
         self._warp(rows)
         atlas, centers = _atlas(self._warped[rows], grey.shape)
         aligned, status, _ = cv2.calcOpticalFlowPyrLK(
