@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.images import MappedImage, gather
-from factorsfm.observability import Motion, classify_motion
+from factorsfm.marginals import in_scene_unit
+from factorsfm.observability import Motion, camera_observability, classify_motion, pose_blocks
 from factorsfm.options import FOCAL_STD, Options, PolishOptions
 from factorsfm.prior_term import PriorPart, joint_problem, weigh_prior
 from factorsfm.problem import Observations, State
-from factorsfm.reconstruction import ShotKind
+from factorsfm.reconstruction import CameraObservability, ShotKind
 from factorsfm.refinement import BundleAdjustment
 from factorsfm.registration import register_image
 from factorsfm.triangulation import triangulate
@@ -39,7 +40,9 @@ class Polished:
     Attributes:
         frames: (k,) positions of the images in `state`; tracks: (n,) track of each point.
         errors: (m,) reprojection errors of `observations` (pixels); sigma: their standard deviation.
-        covariance: (k, 6, 6) of the poses, GTSAM's convention.
+        covariance: (k, 6, 6) of the poses, GTSAM's convention, `in_scene_unit`.
+        observability: what carries each of them.
+        point_std: (n,) standard deviations of the inverse distances, in the same unit.
         focal_std: relative standard deviation of the focal length, None where it was not estimated.
     """
 
@@ -51,6 +54,8 @@ class Polished:
     sigma: float
     motion: Motion
     covariance: Array
+    observability: list[CameraObservability]
+    point_std: Array
     prior: PriorPart | None = None
     focal_std: float | None = None
 
@@ -115,15 +120,17 @@ def polish(
     adjustment.solve(o.final_iterations)
     if prior is not None:
         prior.residual = adjustment.prior_residuals()
-    camera_covariance = _at_fixed_scale(adjustment.covariance(np.zeros(0, np.int64))[0], adjustment.state)
+    marginals = adjustment.marginals()
+    camera_covariance = in_scene_unit(marginals, adjustment.state)
+    observability = camera_observability(adjustment, marginals, camera_covariance)
     k = len(frames)
-    poses = np.stack([camera_covariance[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i in range(k)])
     if prior is not None:
         affine = np.sqrt(camera_covariance.diagonal()[6 * k + 1 : 6 * k + 1 + 2 * len(prior.images)])
         prior.scale_std, prior.shift_std = affine[::2], affine[1::2]
     result = Polished(
         frames, adjustment.state, tracks, observations, adjustment.reprojection_errors(), sigma,
-        motion, poses, prior, focal_std,
+        motion, pose_blocks(camera_covariance, k), observability,
+        marginals.inverse_distance_std(camera_covariance), prior, focal_std,
     )  # fmt: skip
     if len(frames) < len(registered):
         progress("polish: frames between")
@@ -330,25 +337,6 @@ def _temporal_inflation(adjustment: BundleAdjustment, observations: Observations
     return (1.0 + correlation) / (1.0 - correlation)
 
 
-def _at_fixed_scale(covariance: Array, state: State) -> Array:
-    """Covariance of the cameras and affines given the unit of length, which only weak priors hold.
-
-    Conditioned on no change along ``d``, the direction in which all translations and scales grow together.
-    """
-    k = len(state.rotation)
-    direction = np.zeros(len(covariance))
-    direction[: 6 * k].reshape(k, 6)[:, 3:] = -state.translation
-    direction[6 * k + 1 : 6 * k + 1 + 2 * len(state.scale) : 2] = state.scale
-    variable = np.nonzero(covariance.diagonal() > 0.0)[0]
-    d = direction[variable]
-    if not d.any():
-        return covariance
-    information = float(d @ np.linalg.solve(covariance[np.ix_(variable, variable)], d))
-    result = covariance.copy()
-    result[np.ix_(variable, variable)] -= np.outer(d, d) / max(information, 1e-300)
-    return result
-
-
 # --- long shots -------------------------------------------------------------------------------------------------
 
 
@@ -396,6 +384,7 @@ def _add_frames_between(
         translation=np.array([poses[f][1] for f in frames]),
     )
     result.covariance = result.covariance[nearest]
+    result.observability = [result.observability[k] for k in nearest]
     if result.prior is not None:
         new_row = np.array([row[f] for f in result.frames])
         p = result.prior

@@ -50,6 +50,34 @@ class PriorFit:
     sigma: float
 
 
+@dataclass(frozen=True, slots=True)
+class CameraObservability:
+    """What carries the pose of a camera.
+
+    Information is the inverse of the mean squared error: a share of 0.75 says that the same tracks without the prior
+    would leave twice the error. The shares are about the camera's position relative to the scene as a whole: in the
+    coordinates (position, orientation, unit of length) in which the points are where they should be in the
+    least-squares sense (distant and badly determined ones count less). The pixel slide is relative to the first
+    registered camera, like `FrameResult.covariance`. Both speak of the random errors of tracks and prior, not of
+    tracks that are wrong together: on rendered shots of three seconds the true drift, 0.01 to 0.25 pixels, was 2 to 17
+    times the pixel slide.
+
+    Attributes:
+        prior_share: what the depth prior adds to the information on the position, ``1 - trace(C) / trace(C0)`` with
+            the covariances of the position with and without the prior; NaN where no translation is estimated.
+        prior_share_view_axis: the same of the position along the view axis, ``1 - C_zz / C0_zz``.
+        triangulation_angle_deg: median over the camera's points of the largest angle between two rays of a point.
+        pixel_slide: how far a virtual object may drift against the footage since the first frame because of the
+            pose's uncertainty: one standard deviation in the worst direction, pixels, of an object that rests in the
+            world in front of the image centre, at the median depth of the camera's points.
+    """
+
+    prior_share: float
+    prior_share_view_axis: float
+    triangulation_angle_deg: float
+    pixel_slide: float
+
+
 @dataclass(slots=True)
 class FrameResult:
     """One frame of the source.
@@ -64,8 +92,11 @@ class FrameResult:
         observations, inliers: tracked points in the frame, and those that the final model explains.
         reprojection_error: median over the inliers (pixels), NaN where not registered.
         prior: fitted scale and shift of the depth prior, None where the frame carries none.
-        covariance: (6, 6) of (rotation vector, translation), a perturbation of `world_from_cam` on the right; None
-            where not registered.
+        covariance: (6, 6) of (rotation vector, translation), a perturbation of `world_from_cam` on the right, relative
+            to the first registered camera in the scene's unit of length, which is the mean inverse distance of the
+            points; None where not registered.
+        observability: what carries the pose, None where not registered.
+        thumbnail: a small JPEG of the image, None where none is kept.
     """
 
     index: int
@@ -80,6 +111,8 @@ class FrameResult:
     reprojection_error: float = float("nan")
     prior: PriorFit | None = None
     covariance: NDArray[np.float64] | None = None
+    observability: CameraObservability | None = None
+    thumbnail: bytes | None = None
 
     @property
     def registered(self) -> bool:
@@ -104,6 +137,8 @@ class Reconstruction:
             ``scale / z``, NaN where the observation carries no prior.
         kind: what the motion allows one to recover.
         parallax: largest camera displacement over the median point depth (paper, section 4).
+        point_std: (n,) standard deviation of the inverse distance of each point from the first registered camera,
+            relative to it, in the unit of `FrameResult.covariance`; None where it is not known.
         metric: whether the world unit is the metre (the prior is metric).
         notes: sentences that a user should read (translation unobservable, focal length guessed, ...).
         seconds: wall time by stage.
@@ -122,6 +157,7 @@ class Reconstruction:
     prior_residual: NDArray[np.float64]
     kind: ShotKind
     parallax: float
+    point_std: NDArray[np.float64] | None = None
     metric: bool = False
     notes: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.factors import affine_inverse_depth, by_pose, cauchy, reprojection
+from factorsfm.marginals import Marginals, cross_matrices, tangent_basis
 from factorsfm.options import PolishOptions
 from factorsfm.problem import Observations, PriorObservations, State
 
@@ -172,7 +173,7 @@ class BundleAdjustment:
 
     def _terms(self) -> list[_Term]:
         s, o = self.state, self.observations
-        tangent = _tangent_basis(s.bearing)
+        tangent = tangent_basis(s.bearing)
         residual, by_q, q = self._reprojection(s)
         weight = np.sqrt(cauchy(residual, self.options.kernel)[1])
         gain = np.ascontiguousarray((by_q * weight[:, None, None]).transpose(1, 0, 2))
@@ -348,7 +349,7 @@ class BundleAdjustment:
         s = self.state
         pose = camera[: self._lens].reshape(-1, 6)
         turn = _exponential(-pose[:, :3])
-        bearing = s.bearing + np.einsum("nij,nj->ni", _tangent_basis(s.bearing), point[:, :2])
+        bearing = s.bearing + np.einsum("nij,nj->ni", tangent_basis(s.bearing), point[:, :2])
         length = np.linalg.norm(bearing, axis=1)
         affine = camera[self._affine : self._field].reshape(-1, 2)
         return State(
@@ -399,21 +400,27 @@ class BundleAdjustment:
             (c, c) over the columns (six per frame in GTSAM's pose convention, log focal, scale and shift per image,
             field), zero where a column is fixed; (p, p) of the inverse distances of `points`.
         """
-        normal = self._linearize()
-        blocks = self._cross_blocks(normal)
-        information, _, point_covariance = self._reduced(normal, blocks, 0.0)
-        free = self._free
-        camera = np.zeros((self._columns, self._columns))
-        camera[np.ix_(free, free)] = np.linalg.inv(_conditioned(information[np.ix_(free, free)]))
+        marginals = self.marginals()
+        camera, given_camera = marginals.camera, marginals.point
         gain = np.zeros((len(points), self._columns))
-        for cross, columns, span in blocks:
+        for cross, columns, span in marginals.blocks:
             inside = np.nonzero((points >= span.start) & (points < span.stop))[0]
             local = points[inside] - span.start
             picked = cross.reshape(len(columns), -1, 3)[:, local]
-            gain[np.ix_(inside, columns)] = np.einsum("cpi,pi->pc", picked, point_covariance[points[inside], 2])
+            gain[np.ix_(inside, columns)] = np.einsum("cpi,pi->pc", picked, given_camera[points[inside], 2])
         joint = gain @ camera @ gain.T
-        joint[np.diag_indices_from(joint)] += point_covariance[points, 2, 2]
+        joint[np.diag_indices_from(joint)] += given_camera[points, 2, 2]
         return camera, joint
+
+    def marginals(self) -> Marginals:
+        """Everything that covariances are made of, at the present state."""
+        normal = self._linearize()
+        blocks = self._cross_blocks(normal)
+        information, _, given_camera = self._reduced(normal, blocks, 0.0)
+        free = self._free
+        camera = np.zeros((self._columns, self._columns))
+        camera[np.ix_(free, free)] = np.linalg.inv(_conditioned(information[np.ix_(free, free)]))
+        return Marginals(camera, given_camera, blocks)
 
 
 def _conditioned(information: Array) -> Array:
@@ -421,20 +428,10 @@ def _conditioned(information: Array) -> Array:
     return np.asarray(information + np.diag(1e-12 * np.maximum(information.diagonal(), 1e-300)))
 
 
-def _tangent_basis(bearing: Array) -> Array:
-    """(n, 3, 2) orthonormal basis of the plane perpendicular to each unit vector."""
-    axis = np.where(np.abs(bearing[:, :1]) < 0.7, np.array([[1.0, 0.0, 0.0]]), np.array([[0.0, 1.0, 0.0]]))
-    first = np.cross(bearing, axis)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    return np.stack([first, np.cross(bearing, first)], -1)
-
-
 def _exponential(rotation_vector: Array) -> Array:
     """(n, 3, 3) rotation matrices of (n, 3) rotation vectors."""
     angle = np.linalg.norm(rotation_vector, axis=1)[:, None, None]
-    x, y, z = rotation_vector.T
-    zero = np.zeros_like(x)
-    hat = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
+    hat = cross_matrices(rotation_vector)
     safe = np.maximum(angle, 1e-8)
     half = np.sinc(angle / 2.0 / np.pi) ** 2 / 2.0
     return np.asarray(np.eye(3) + np.sin(safe) / safe * hat + half * (hat @ hat))

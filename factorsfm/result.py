@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from factorsfm.camera import with_focal
 from factorsfm.images import MappedImage
+from factorsfm.observability import observability_notes
 from factorsfm.options import FOCAL_STD
 from factorsfm.polish import Polished
 from factorsfm.problem import State
@@ -72,6 +73,9 @@ def assemble(
         ids = images[positions[k]].tracks.ids
         xy[mine] = pixels[positions[k]][np.searchsorted(ids, polished.tracks[point[mine]])]
     points = state.bearing[kept] / state.inverse_distance[kept, None] * unit
+    general = polished.motion.kind is ShotKind.GENERAL
+    frame_results = _frame_results(polished, images, frames, unit)
+    notes += observability_notes(frame_results)
     prior_residual = np.full(len(observations.point), np.nan)
     if polished.prior is not None:
         p = polished.prior
@@ -82,7 +86,7 @@ def assemble(
         prior_residual[at] = (p.residual / np.maximum(np.abs(predicted), 1e-6))[order]
     return Reconstruction(
         camera=camera,
-        frames=_frame_results(polished, images, frames, unit),
+        frames=frame_results,
         points=points,
         colors=colors[polished.tracks[kept]],
         track_ids=polished.tracks[kept],
@@ -93,6 +97,7 @@ def assemble(
         prior_residual=prior_residual[keep],
         kind=polished.motion.kind,
         parallax=_parallax(state),
+        point_std=polished.point_std[kept] / state.inverse_distance[kept] if general else None,
         metric=scale is not None,
         notes=notes,
         seconds=seconds,
@@ -155,6 +160,7 @@ def _frame_results(
             covariance[3:] *= unit
             covariance[:, 3:] *= unit
             result.covariance = covariance
+            result.observability = polished.observability[row]
             result.message = f"{result.inliers} of {seen[row]} tracks within {threshold:.2f} pixels"
             if polished.motion.kind is ShotKind.STATIC:
                 result.status = FrameStatus.STATIC

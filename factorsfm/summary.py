@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -41,6 +42,7 @@ def summary(reconstruction: Reconstruction) -> dict[str, Any]:
         "kind": reconstruction.kind,
         "metric": reconstruction.metric,
         "reprojection_error": median_reprojection_error(reconstruction),
+        "observability": pooled_observability(reconstruction),
         "focal_length": reconstruction.camera.mean_focal_length(),
         "camera": camera_to_json(reconstruction.camera),
         "seconds": with_total(reconstruction.seconds),
@@ -89,6 +91,16 @@ def median_reprojection_error(reconstruction: Reconstruction) -> float:
     return float(np.median(errors)) if len(errors) else float("nan")
 
 
+def pooled_observability(reconstruction: Reconstruction) -> dict[str, float] | None:
+    """Medians over the registered cameras, and the largest pixel slide; None where nothing is known."""
+    cameras = [asdict(f.observability) for f in reconstruction.frames if f.observability is not None]
+    if not cameras:
+        return None
+    # The median of shares that do not exist is NaN.
+    pooled = {name: float(np.median([camera[name] for camera in cameras])) for name in cameras[0]}
+    return {**pooled, "largest_pixel_slide": max(camera["pixel_slide"] for camera in cameras)}
+
+
 def with_total(seconds: Mapping[str, float]) -> dict[str, float]:
     """The stages, and their sum where no total has been measured."""
     return {**seconds, "total": seconds.get("total", sum(seconds.values()))}
@@ -121,6 +133,7 @@ def _frame_json(frame: FrameResult) -> dict[str, Any]:
             "shift_std": prior.shift_std,
             "sigma": prior.sigma,
         },
+        "observability": frame.observability and asdict(frame.observability),
     }
 
 

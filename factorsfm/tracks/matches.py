@@ -7,7 +7,8 @@ interrupted run goes on where it stopped.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -74,11 +75,12 @@ def match_images(
     if database.exists() and not _stored_names(database) <= set(names):
         logger.info("the matches in %s are of other images and are made anew", database)
         database.unlink()
-    _extract(database, images, names, cameras, masks)
-    if len(names) <= EXHAUSTIVE_UP_TO:
-        pycolmap.match_exhaustive(database)
-    else:
-        _match_alike(database, len(names))
+    with _quiet_colmap():
+        _extract(database, images, names, cameras, masks)
+        if len(names) <= EXHAUSTIVE_UP_TO:
+            pycolmap.match_exhaustive(database)
+        else:
+            _match_alike(database, len(names))
     return read_matches(database, names)
 
 
@@ -165,6 +167,17 @@ def _extract(
                 known = pycolmap.Camera(camera.todict())
                 known.camera_id = image.camera_id
                 db.update_camera(known)
+
+
+@contextmanager
+def _quiet_colmap() -> Iterator[None]:
+    """Keep COLMAP from writing its progress to stderr, past all Python logging."""
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = max(level, int(pycolmap.logging.Level.ERROR))
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = level
 
 
 def _match_alike(database: Path, count: int) -> None:
