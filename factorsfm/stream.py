@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
@@ -26,7 +27,7 @@ from factorsfm.camera import (
     pixels_from_normalized,
     with_focal,
 )
-from factorsfm.errors import FactorsfmError, InputError, ModelError, ReconstructionError
+from factorsfm.errors import InputError, ModelError, ReconstructionError
 from factorsfm.frames import Frame, bgr_image
 from factorsfm.images import ImageTracks, MappedImage
 from factorsfm.mapper import Mapper
@@ -34,6 +35,7 @@ from factorsfm.options import Options
 from factorsfm.polish import polish
 from factorsfm.priors.depth import DepthKind, DepthPrior
 from factorsfm.priors.masks import MaskPrior
+from factorsfm.reading import read_depth, read_mask
 from factorsfm.reconstruction import FrameResult, FrameStatus, Reconstruction
 from factorsfm.registration import ImageDepth
 from factorsfm.relocalization import Relocalizer
@@ -41,7 +43,9 @@ from factorsfm.result import assemble
 from factorsfm.snapshot import read_snapshot, write_snapshot
 from factorsfm.tracks.flow import FlowTracker
 
-_STATE = ("_size", "_colors", "_pixels", "_focal_guessed")
+logger = logging.getLogger(__name__)
+
+_STATE = ("_size", "_colors", "_pixels", "_focal_guessed", "_without_depth")
 _REVIVAL_INTERVAL = 5  # frames
 _BLANK_TEXTURE = 0.2  # grey levels; below this an image is black, white or out of focus
 
@@ -137,6 +141,7 @@ class Stream:
         self._colors = np.zeros((0, 3), np.uint8)
         self._pixels: list[NDArray[np.float64]] = []
         self._focal_guessed = False
+        self._without_depth: list[str] = []  # why the prior failed, once for every frame
 
     def push(self, frame: Frame | NDArray[np.uint8]) -> FrameUpdate:
         """Take the next frame.
@@ -146,7 +151,8 @@ class Stream:
 
         Raises:
             InputError: it is no image, its size differs from that of the frames before or contradicts the camera, or
-                a prior fails on it; after the former the stream can go on with another frame.
+                a prior fails on it (the depth prior: before there is a map, later the frame goes without); the stream
+                can go on with another frame.
         """
         frame = as_frame(frame, len(self.frames))
         mapper = self._mapper or self._open(frame)
@@ -156,7 +162,7 @@ class Stream:
                 f"expected {self._size[0]}x{self._size[1]} as the frames before"
             )
         with self._timed("masks"):
-            mask = self._read_mask(frame)
+            mask = read_mask(self._masks, frame)
         with self._timed("tracking"):
             tracked = self._tracker.track(frame.image, mask)
         self._remember_colors(frame.image, tracked.ids, tracked.xy)
@@ -268,7 +274,7 @@ class Stream:
                 self.options,
                 lambda stage: progress(stage, 0, None) if progress else None,
             )
-        return assemble(
+        reconstruction = assemble(
             result,
             mapper.images,
             self.frames,
@@ -281,6 +287,10 @@ class Stream:
             seconds=dict(self.seconds),
             options=self.options.to_dict(),
         )
+        if self._without_depth:
+            count, first = len(self._without_depth), self._without_depth[0]
+            reconstruction.notes.append(f"Frames that went without depth because the prior failed: {count}; {first}.")
+        return reconstruction
 
     def close(self) -> None:
         """Give up without a result; `finish` closes, too."""
@@ -350,8 +360,8 @@ class Stream:
             unit = keyframe.tracks.depth.unit
             prior = KeyframePrior(self.frames[guided[-1]].index, keyframe.affine[0] * unit, keyframe.affine[1] * unit)
         return FrameUpdate(
-            frame.index, image.status, image.message, _pose(image), image.keyframe, len(image.tracks.ids), image.inliers,
-            mapper.new_points, mapper.parallax, image.covariance, prior, frame.dropped,
+            frame.index, image.status, image.message, _pose(image), image.keyframe, len(image.tracks.ids),
+            image.inliers, mapper.new_points, mapper.parallax, image.covariance, prior, frame.dropped,
             focal_length=mapper.focal, focal_changed=focal_changed,
         )  # fmt: skip
 
@@ -366,31 +376,19 @@ class Stream:
         ]  # fmt: skip
         return ReconstructionError(message, frames)
 
-    def _read_mask(self, frame: Frame) -> NDArray[np.bool_] | None:
-        if self._masks is None:
-            return None
-        with _failure_named("mask", frame):
-            mask = self._masks(frame)
-        if mask is not None and mask.shape != frame.image.shape[:2]:
-            raise InputError(
-                f"the mask of frame {frame.index} has shape {mask.shape}, expected {frame.image.shape[:2]} as the frame"
-            )
-        return mask
-
     def _read_depth(self, frame: Frame, xy: NDArray[np.float64]) -> ImageDepth | None:
+        """The prior at keypoints; once there is a map, a frame on which it fails goes without."""
         assert self._depth is not None
+        assert self._mapper is not None
         with self._timed("depth"):
-            with _failure_named("depth", frame):
-                depth_map = self._depth(frame)
-            if depth_map is None:
+            try:
+                return read_depth(self._depth, frame, xy)
+            except ModelError as error:
+                if not self._mapper.started:
+                    raise
+                logger.warning("%s; the frame goes without", error)
+                self._without_depth.append(str(error))
                 return None
-            inverse, reliability = depth_map.inverse_depth(xy, self._size)
-        valid = np.isfinite(inverse) & (inverse > 0.0)
-        if valid.sum() < 10:
-            return None
-        unit = float(np.median(inverse[valid]))
-        free_shift = self._depth.kind is DepthKind.INVERSE
-        return ImageDepth(inverse / unit, reliability, unit, free_shift)
 
     def _remember_colors(self, image: NDArray[np.uint8], ids: NDArray[np.int64], xy: NDArray[np.float64]) -> None:
         """Colour of each track at its first appearance, RGB."""
@@ -421,17 +419,6 @@ def as_frame(frame: Frame | NDArray[np.uint8], index: int) -> Frame:
     if not isinstance(frame, Frame):
         frame = Frame(index, frame, f"{index:06d}", None)
     return replace(frame, image=bgr_image(frame.image, frame.index))
-
-
-@contextmanager
-def _failure_named(what: str, frame: Frame) -> Iterator[None]:
-    """A prior is foreign code: whatever it raises becomes an error that names the frame."""
-    try:
-        yield
-    except FactorsfmError:
-        raise
-    except Exception as error:
-        raise ModelError(f"the {what} prior failed on frame {frame.index}: {error!r}") from error
 
 
 def _mark_blank(image: MappedImage, texture: float) -> None:

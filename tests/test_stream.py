@@ -20,6 +20,7 @@ from factorsfm import (
     ShotKind,
     Stream,
 )
+from factorsfm.synthetic import render_shot, simulate_prior
 
 QUICK = with_fewer_tracks(Options())
 
@@ -171,15 +172,46 @@ def test_an_unknown_lens_is_guessed_and_estimated():
 
 
 class Failing(Maps):
+    """Fails on some frames."""
+
+    def __init__(self, frames: set[int]) -> None:
+        super().__init__(simulated_maps("dolly"))
+        self.failing = frames
+        self.asked: list[int] = []
+
     def __call__(self, frame):
-        if frame.index in (0, 3):
+        self.asked.append(frame.index)
+        if frame.index in self.failing:
             raise RuntimeError("out of memory")
         return super().__call__(frame)
 
 
-def test_a_depth_network_that_raises_is_named_with_the_frame():
+def test_a_depth_network_that_raises_at_once_is_named_with_the_frame():
+    s = stream(depth=Failing({0}))
     with pytest.raises(ModelError, match=r"depth prior failed on frame 0: RuntimeError\('out of memory'\)"):
-        stream(depth=Failing(simulated_maps("dolly"))).push(rendered("dolly").images[0])
+        s.push(rendered("dolly").images[0])
+    updates = [s.push(Frame(k, rendered("dolly").images[k], str(k))) for k in range(1, FRAMES)]  # it can go on
+    assert {update.status for update in updates} == {FrameStatus.REGISTERED}
+
+
+@pytest.mark.parametrize("preset", ["default", "paper"])
+def test_a_depth_network_that_raises_later_is_done_without(preset, caplog):
+    paper = preset == "paper"
+    motion = render_shot("dolly", 14, 320, 180) if paper else rendered("dolly")
+    depth = Failing(set(range(1, 11)) if not paper else {11, 12, 13})
+    depth.maps = simulate_prior(motion)
+    s = stream(depth=depth, options=with_fewer_tracks(factorsfm.PRESETS[preset]))
+    for image in motion.images:
+        s.push(image)
+    result = s.finish()
+    failed = sorted(depth.failing.intersection(depth.asked))
+    assert failed
+    assert len(result.registered) == len(motion.images)
+    (note,) = [note for note in result.notes if "went without depth" in note]
+    assert f"because the prior failed: {len(failed)}; the depth prior failed on frame {failed[0]}: Runtime" in note
+    assert [record.levelname for record in caplog.records] == ["WARNING"] * len(failed)
+    assert "the frame goes without" in caplog.text
+    assert all(result.frames[k].prior is None for k in failed)
 
 
 @pytest.mark.parametrize(
