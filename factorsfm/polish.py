@@ -28,6 +28,7 @@ logger = logging.getLogger(__name__)
 _FIRST_SIGMA_PX = 0.25
 _SMALLEST_SIGMA_PX = 0.03
 _RAYLEIGH_MEDIAN = 1.1774  # median of the norm of a 2-D error, in standard deviations
+_BLOCKS = (8, 5, 16)  # across, down, frames: in which errors may be alike
 _DOUBTFUL_INFLATION = 3.0  # sound solutions have 1 to 2
 _CORE_TRACKS = 400  # tracks with which the cameras converge first
 _TRIANGULATION_VIEWS = 10
@@ -89,7 +90,7 @@ def polish(
         ratio = focal / float(np.exp(adjustment.state.log_focal))
         few, observations = (replace(part, xy=part.xy * ratio) for part in (few, observations))
     motion = classify_motion(adjustment, few, o)
-    inflation = _temporal_inflation(adjustment, few)
+    inflation = _block_inflation(adjustment, few)
     weighed = None
     if motion.kind is ShotKind.GENERAL:
         if o.depth:
@@ -110,7 +111,7 @@ def polish(
         observations, tracks, state = _without_outlying_observations(state, observations, tracks, limit, o)
     progress("polish: all tracks")
     prior = None
-    # Pixel errors that repeat themselves from frame to frame weigh less; the kernel keeps its width in pixels.
+    # Pixel errors that repeat themselves, from frame to frame and among neighbours, weigh less; the kernel keeps its width in pixels.
     wide = float(np.sqrt(inflation))
     final = replace(o, kernel=o.kernel / wide)
     if weighed is not None:
@@ -335,6 +336,23 @@ def _temporal_inflation(adjustment: BundleAdjustment, observations: Observations
     correlation = float((a * b).sum()) / max(power, 1e-12)
     correlation = min(max(correlation, 0.0), 0.9)
     return (1.0 + correlation) / (1.0 - correlation)
+
+
+def _block_inflation(adjustment: BundleAdjustment, observations: Observations) -> float:
+    """By how much the errors of neighbouring tracks in neighbouring frames repeat each other, as a factor on the variance.
+
+    In a block of the image and of time, independent errors add up to the root of their number.
+    """
+    o, residual = observations, adjustment.reprojection_vectors()
+    size = np.linalg.norm(residual, axis=1)
+    inlier = size < 3.0 * np.median(size)
+    low, high = o.xy.min(0), o.xy.max(0)
+    cell = (0.999 * (o.xy - low) / np.maximum(high - low, 1e-9) * _BLOCKS[:2]).astype(np.int64)
+    key = ((o.frame // _BLOCKS[2]) * _BLOCKS[1] + cell[:, 1]) * _BLOCKS[0] + cell[:, 0]
+    key, residual = key[inlier], residual[inlier]
+    sums = [np.bincount(key, residual[:, axis]) for axis in range(2)]
+    power = float((residual**2).sum())
+    return max(1.0, float((sums[0] ** 2 + sums[1] ** 2).sum()) / max(power, 1e-12))
 
 
 # --- long shots -------------------------------------------------------------------------------------------------
