@@ -91,14 +91,14 @@ def _from_shot(
     for done, frame in enumerate(iterator):
         if stream is None:
             if camera is None:
-                camera = _guessed_camera(source, frame)
+                camera = guessed_camera(source, frame)
             stream = Stream(camera, depth=depth, masks=masks, options=options)
         if progress is not None:
             progress("frames", done, None)
         stream.push(frame)
     if stream is None:
         raise InputError(f"no frames in {source}")
-    _check_matched(source, depth, masks)
+    check_matched(source, depth, masks)
     return stream.finish(progress)
 
 
@@ -125,7 +125,7 @@ def _from_images(
             else:
                 images.leave_out(image.index, image.name, image.reason)
         result = images.finish(progress)
-        _check_matched(source, depth, masks)
+        check_matched(source, depth, masks)
         return result
 
 
@@ -138,13 +138,14 @@ def _work_folder(work: str | Path | None) -> Iterator[Path]:
         yield Path(folder)
 
 
-def _check_matched(source: object, depth: DepthPrior | None, masks: MaskPrior | None) -> None:
+def check_matched(source: object, depth: DepthPrior | None, masks: MaskPrior | None) -> None:
+    """After all frames: a folder of maps or masks of which none belongs to a frame is an InputError."""
     for name, folder in (("depth map", depth), ("mask", masks)):
         if isinstance(folder, DepthFolder | MaskFolder) and folder.asked and not folder.matched:
             raise InputError(f"no {name} in the given folder matches a frame of {source}")
 
 
-def _guessed_camera(source: object, frame: Frame) -> pycolmap.Camera:
+def guessed_camera(source: object, frame: Frame) -> pycolmap.Camera:
     """EXIF of the first image of a folder, else the documented guess."""
     height, width = frame.image.shape[:2]
     image = Path(source) / frame.name if isinstance(source, str | Path) and Path(source).is_dir() else None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+import shutil
 import sys
 import time
 from collections.abc import Sequence
@@ -11,7 +12,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, NoReturn, TextIO
 
-from factorsfm import api, demo
+from factorsfm import api, demo, stream_command
 from factorsfm.camera import read_camera
 from factorsfm.errors import FactorsfmError, ReconstructionError
 from factorsfm.export import command as export_command
@@ -19,8 +20,8 @@ from factorsfm.export.folder import check_directory, write_failure, write_folder
 from factorsfm.frames import parse_range
 from factorsfm.options import PRESETS
 from factorsfm.priors.depth import DepthKind
-from factorsfm.reconstruction import Reconstruction
-from factorsfm.summary import program_version, verdict
+from factorsfm.stream_command import unless_none
+from factorsfm.summary import conclusion, program_version
 
 BAD_INPUT, NOT_RECONSTRUCTED, INTERRUPTED = 2, 3, 130
 
@@ -32,14 +33,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         The exit status: 0 done, 2 bad input, 3 the shot cannot be reconstructed, 130 interrupted.
     """
     arguments = _parser().parse_args(argv)
+    progress = _Progress(sys.stderr, enabled=sys.stderr.isatty() and not arguments.verbose)
     level = (logging.WARNING, logging.INFO, logging.DEBUG)[min(arguments.verbose, 2)]
-    logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s")
+    logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s", handlers=[_LogHandler(progress)])
     try:
-        with _Progress(sys.stderr, enabled=sys.stderr.isatty() and not arguments.verbose) as progress:
+        with progress:
             if arguments.command == "demo":
                 _demo(arguments, progress)
             elif arguments.command == "export":
                 print(export_command.run(arguments))
+            elif arguments.command == "stream":
+                print(stream_command.run(arguments, progress, progress.show))
             else:
                 _reconstruct(arguments, progress)
     except ReconstructionError as error:
@@ -60,9 +64,9 @@ def _reconstruct(arguments: argparse.Namespace, progress: _Progress) -> None:
         reconstruction = api.reconstruct(
             arguments.source,
             camera=camera,
-            depth=_unless_none(arguments.depth),
+            depth=unless_none(arguments.depth),
             depth_kind=arguments.depth_kind,
-            masks=_unless_none(arguments.masks),
+            masks=unless_none(arguments.masks),
             frames=frames,
             preset=arguments.preset,
             unordered=arguments.unordered or None,
@@ -77,25 +81,14 @@ def _reconstruct(arguments: argparse.Namespace, progress: _Progress) -> None:
     progress("writing", 0, None)
     write_folder(reconstruction, arguments.output)
     progress.clear()
-    _report(reconstruction, arguments.output)
+    print(conclusion(reconstruction, arguments.output))
 
 
 def _demo(arguments: argparse.Namespace, progress: _Progress) -> None:
     result = demo.run_demo(arguments.output, progress)
     progress.clear()
-    _report(result.reconstruction, arguments.output)
+    print(conclusion(result.reconstruction, arguments.output))
     print(result.comparison())
-
-
-def _report(reconstruction: Reconstruction, output: Path) -> None:
-    print(f"{verdict(reconstruction)}.")
-    for note in reconstruction.notes:
-        print(f"Note: {note}")
-    print(f"Result in {output}; open {output / 'report.html'}")
-
-
-def _unless_none(text: str | None) -> str | None:
-    return None if text == "none" else text
 
 
 def _complain(message: str, status: int) -> int:
@@ -113,19 +106,26 @@ class _Progress:
         self._enabled = enabled
         self._stage = ""
         self._written = 0.0
+        self._shown = False
 
     def __call__(self, stage: str, done: int, total: int | None) -> None:
-        now = time.monotonic()
-        if not self._enabled or (stage == self._stage and now < self._written + self._SECONDS_BETWEEN):
-            return
-        self._stage, self._written = stage, now
         count = f" {done}/{total}" if total is not None else f" {done}" if done else ""
-        self._stream.write(f"\r\x1b[K{stage}{count}")
+        self.show(f"{stage}{count}", at_once=stage != self._stage)
+        self._stage = stage
+
+    def show(self, text: str, at_once: bool = False) -> None:
+        """Replace the line; what comes too soon after another one is left out."""
+        now = time.monotonic()
+        if not self._enabled or (not at_once and now < self._written + self._SECONDS_BETWEEN):
+            return
+        self._written, self._shown = now, True
+        columns = shutil.get_terminal_size().columns
+        self._stream.write(f"\r\x1b[K{text[: columns - 1]}")
         self._stream.flush()
 
     def clear(self) -> None:
-        if self._stage:
-            self._stage = ""
+        if self._shown:
+            self._stage, self._shown = "", False
             self._stream.write("\r\x1b[K")
             self._stream.flush()
 
@@ -136,6 +136,18 @@ class _Progress:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.clear()
+
+
+class _LogHandler(logging.StreamHandler[TextIO]):
+    """Log lines on stderr, in place of the line of progress."""
+
+    def __init__(self, progress: _Progress) -> None:
+        super().__init__()
+        self._progress = progress
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._progress.clear()
+        super().emit(record)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -165,34 +177,7 @@ def _parser() -> argparse.ArgumentParser:
         description="Recover camera path, lens and sparse points of a shot.",
     )
     reconstruct.add_argument("source", metavar="SOURCE", help="a video file, or a folder of images")
-    reconstruct.add_argument(
-        "--output",
-        type=Path,
-        required=True,
-        metavar="DIR",
-        help="folder of the result: new, empty, or holding an earlier result, which is replaced",
-    )
-    reconstruct.add_argument(
-        "--camera", type=Path, metavar="FILE.json", help="width, height, fx, fy, cx, cy; default: estimated"
-    )
-    reconstruct.add_argument(
-        "--depth",
-        default="tcmonodepth",
-        metavar="MODEL.onnx|NAME|FOLDER|none",
-        help="depth prior: a network, a named model, or a folder of maps (default: %(default)s)",
-    )
-    reconstruct.add_argument(
-        "--depth-kind",
-        choices=[kind.value for kind in DepthKind],
-        help="what the depth prior holds, where it cannot be known",
-    )
-    reconstruct.add_argument(
-        "--masks",
-        metavar="FOLDER|MODEL.onnx|none",
-        help="what moves and is to be ignored: non-zero in the masks (default: none)",
-    )
-    reconstruct.add_argument("--frames", metavar="START:STOP[:STEP]", help="counted from 0, without STOP")
-    reconstruct.add_argument("--preset", choices=list(PRESETS), default="default", help="default: %(default)s")
+    _add_shot_arguments(reconstruct)
     reconstruct.add_argument(
         "--unordered",
         action="store_true",
@@ -204,6 +189,16 @@ def _parser() -> argparse.ArgumentParser:
         metavar="DIR",
         help="keep features and matches of an unordered set here: an interrupted run goes on from them",
     )
+
+    stream = commands.add_parser(
+        "stream",
+        parents=[common],
+        help="follow a shot while it arrives: from a camera, a network, a pipe, a folder that fills, or a file",
+        description="Give every frame a pose as it arrives; at the end, or at Ctrl-C, polish and write the result.",
+    )
+    stream_command.add_source(stream)
+    _add_shot_arguments(stream)
+    stream_command.add_arguments(stream)
 
     demo_command = commands.add_parser(
         "demo",
@@ -227,3 +222,35 @@ def _parser() -> argparse.ArgumentParser:
     )
     export_command.add_arguments(export_parser)
     return parser
+
+
+def _add_shot_arguments(parser: argparse.ArgumentParser) -> None:
+    """What a shot is reconstructed with, and where the result goes."""
+    parser.add_argument(
+        "--output",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="folder of the result: new, empty, or holding an earlier result, which is replaced",
+    )
+    parser.add_argument(
+        "--camera", type=Path, metavar="FILE.json", help="width, height, fx, fy, cx, cy; default: estimated"
+    )
+    parser.add_argument(
+        "--depth",
+        default="tcmonodepth",
+        metavar="MODEL.onnx|NAME|FOLDER|none",
+        help="depth prior: a network, a named model, or a folder of maps (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--depth-kind",
+        choices=[kind.value for kind in DepthKind],
+        help="what the depth prior holds, where it cannot be known",
+    )
+    parser.add_argument(
+        "--masks",
+        metavar="FOLDER|MODEL.onnx|none",
+        help="what moves and is to be ignored: non-zero in the masks (default: none)",
+    )
+    parser.add_argument("--frames", metavar="START:STOP[:STEP]", help="counted from 0, without STOP")
+    parser.add_argument("--preset", choices=list(PRESETS), default="default", help="default: %(default)s")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from types import TracebackType
 
 import numpy as np
 import pycolmap
@@ -77,8 +78,8 @@ class Episode:
         shot = self._detector.push(frame).shot
         self._pushed += 1
         if shot is not None and shot != self._shot:
-            if shot < self._shot:  # it was an interruption
-                self._streams.pop(self._shot)
+            for number in [n for n in self._streams if n > shot]:  # they were an interruption
+                self._streams.pop(number).close()
             self._shot = shot
         if self._shot not in self._streams:
             self._streams[self._shot] = Stream(
@@ -92,6 +93,11 @@ class Episode:
                     self._results.append(self._worker.submit(_finish, self._streams.pop(number), None))
         return replace(update, shot=self._shot)
 
+    @property
+    def stream(self) -> Stream:
+        """That of the shot to which the newest frame belongs."""
+        return self._streams[self._shot]
+
     def finish(self, progress: Callable[[str, int, int | None], None] | None = None) -> list[ShotResult]:
         """Polish what is not polished yet; all shots in order of time."""
         self._results += [
@@ -99,6 +105,20 @@ class Episode:
         ]
         self._worker.shutdown()
         return [result.result() for result in self._results]
+
+    def close(self) -> None:
+        """Give up what is not finished."""
+        self._worker.shutdown(wait=False, cancel_futures=True)
+        for stream in self._streams.values():
+            stream.close()
+
+    def __enter__(self) -> Episode:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
 
 
 def _finish(stream: Stream, progress: Callable[[str, int, int | None], None] | None) -> ShotResult:

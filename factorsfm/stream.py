@@ -194,6 +194,21 @@ class Stream:
         self._mapper.refresh()
         return [_pose(image) for image in self._mapper.images]
 
+    @property
+    def points(self) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+        """(n, 3) points of the map as it is now, and (n, 3) their colours, RGB."""
+        if self._mapper is None:
+            return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+        ids, points = self._mapper.points.all()
+        return points, self._colors[ids]
+
+    @property
+    def tracks(self) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """(n, 2) tracked points of the newest frame (pixels), and (n,) whether the map holds them."""
+        if self._mapper is None or not self._pixels:
+            return np.zeros((0, 2)), np.zeros(0, bool)
+        return self._pixels[-1], self._mapper.points.contains(self._mapper.images[-1].tracks.ids)
+
     def save(self, path: str | Path) -> None:
         """Write everything that is known so far as one file, whole or not at all; the stream can go on.
 

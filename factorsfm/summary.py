@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -82,6 +83,12 @@ def verdict(reconstruction: Reconstruction) -> str:
         return f"{sentence}, parallax {reconstruction.parallax:.3f}"
     motion = "pure rotation" if reconstruction.kind is ShotKind.ROTATION else "static camera"
     return f"{sentence}; {motion}, no parallax"
+
+
+def conclusion(reconstruction: Reconstruction, output: Path) -> str:
+    """What to say of a result that has been written."""
+    notes = [f"Note: {note}" for note in reconstruction.notes]
+    return "\n".join([f"{verdict(reconstruction)}.", *notes, f"Result in {output}; open {output / 'report.html'}"])
 
 
 def median_reprojection_error(reconstruction: Reconstruction) -> float:
