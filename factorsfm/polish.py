@@ -111,7 +111,8 @@ def polish(
         observations, tracks, state = _without_outlying_observations(state, observations, tracks, limit, o)
     progress("polish: all tracks")
     prior = None
-    # Pixel errors that repeat themselves, from frame to frame and among neighbours, weigh less; the kernel keeps its width in pixels.
+    # Pixel errors that repeat themselves, from frame to frame and among neighbours, weigh less; the kernel keeps its
+    # width in pixels.
     wide = float(np.sqrt(inflation))
     final = replace(o, kernel=o.kernel / wide)
     if weighed is not None:
@@ -339,7 +340,7 @@ def _temporal_inflation(adjustment: BundleAdjustment, observations: Observations
 
 
 def _block_inflation(adjustment: BundleAdjustment, observations: Observations) -> float:
-    """By how much the errors of neighbouring tracks in neighbouring frames repeat each other, as a factor on the variance.
+    """By how much errors of neighbouring tracks in neighbouring frames repeat each other: a factor on the variance.
 
     In a block of the image and of time, independent errors add up to the root of their number.
     """
