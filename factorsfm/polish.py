@@ -29,7 +29,7 @@ _FIRST_SIGMA_PX = 0.25
 _SMALLEST_SIGMA_PX = 0.03
 _RAYLEIGH_MEDIAN = 1.1774  # median of the norm of a 2-D error, in standard deviations
 _BLOCKS = (8, 5, 16)  # across, down, frames: in which errors may be alike
-_DOUBTFUL_INFLATION = 3.0  # sound solutions have 1 to 2
+_DOUBTFUL_INFLATION = 5.0  # sound solutions have 1 to 3.5
 _CORE_TRACKS = 400  # tracks with which the cameras converge first
 _TRIANGULATION_VIEWS = 10
 

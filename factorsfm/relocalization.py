@@ -30,9 +30,9 @@ class View:
 class Relocalizer:
     """Remembers keyframes, and names their tracks in other images."""
 
-    def __init__(self, views: Sequence[View] = ()) -> None:
+    def __init__(self, views: Sequence[View] = (), next_view: int = 0) -> None:
         self.views = list(views)
-        self._next = 0
+        self.next_view = next_view  # with which the next image is compared first
 
     def remember(self, grey: NDArray[np.uint8], ids: Index, xy: NDArray[np.float64]) -> None:
         """Keep a keyframe: (h, w) image, its track ids and their positions (n, 2) in pixels."""
@@ -53,13 +53,13 @@ class Relocalizer:
             _describe(cv2.resize(grey, None, fx=s, fy=s, interpolation=cv2.INTER_AREA), xy * s) for s in _SCALES
         ]
         for step in range(min(_VIEWS_PER_IMAGE, len(self.views))):
-            view = self.views[(self._next + step) % len(self.views)]
+            view = self.views[(self.next_view + step) % len(self.views)]
             for rows, descriptors in described:
                 mine, theirs = _matches(descriptors, view.descriptors)
                 if len(mine) > max(len(best[0]), _LEAST_MATCHES - 1):
                     best = view.ids[theirs], rows[mine]
         if not len(best[0]):
-            self._next = (self._next + _VIEWS_PER_IMAGE) % len(self.views)
+            self.next_view = (self.next_view + _VIEWS_PER_IMAGE) % len(self.views)
         return best
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import tempfile
 from collections.abc import Mapping
@@ -71,8 +72,8 @@ def read_snapshot(path: Path) -> dict[str, Any]:
     end = begin + int.from_bytes(body[len(_MAGIC) : begin], "little")
     try:
         state = _Reader(body[end:]).value(json.loads(body[begin:end]))
-    except (KeyError, TypeError, ValueError, RecursionError) as error:
-        raise InputError(f"snapshot {path} does not hold the state of a stream: {error}") from error
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
+        raise InputError(f"snapshot {path} does not hold the state of a stream: {error!r}") from error
     if not isinstance(state, dict):
         raise InputError(f"snapshot {path} does not hold the state of a stream")
     return state
@@ -124,6 +125,8 @@ class _Reader:
     def _array(self, dtype: str, shape: list[int]) -> NDArray[Any]:
         if dtype not in _DTYPES:
             raise ValueError(f"arrays of {dtype} are not expected")
-        size = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
+        if any(length < 0 for length in shape):
+            raise ValueError(f"an array of shape {shape}")
+        size = math.prod(shape) * np.dtype(dtype).itemsize
         begin, self._position = self._position, self._position + size
         return np.frombuffer(self._data[begin : self._position], dtype).reshape(shape).copy()

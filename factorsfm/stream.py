@@ -225,6 +225,7 @@ class Stream:
                 "frames": [astuple(frame) for frame in self.frames],
                 "tracker": self._tracker.state(),
                 "views": self._relocalizer.views,
+                "next_view": self._relocalizer.next_view,
                 "mapper": self._mapper.state() if self._mapper is not None else None,
             },
         )
@@ -255,7 +256,7 @@ class Stream:
         self.seconds.update(state["seconds"])
         self.frames = [SeenFrame(*frame) for frame in state["frames"]]
         self._tracker.restore(state["tracker"])
-        self._relocalizer = Relocalizer(state["views"])
+        self._relocalizer = Relocalizer(state["views"], state["next_view"])
         if state["mapper"] is not None:
             self._mapper = self._new_mapper()
             self._mapper.restore(state["mapper"])
