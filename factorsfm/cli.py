@@ -20,6 +20,7 @@ from factorsfm.frames import parse_range
 from factorsfm.options import PRESETS
 from factorsfm.priors.depth import DepthKind
 from factorsfm.reconstruction import Reconstruction
+from factorsfm.report import command as overlay_command
 from factorsfm.summary import program_version, verdict
 
 BAD_INPUT, NOT_RECONSTRUCTED, INTERRUPTED = 2, 3, 130
@@ -40,6 +41,10 @@ def main(argv: Sequence[str] | None = None) -> int:
                 _demo(arguments, progress)
             elif arguments.command == "export":
                 print(export_command.run(arguments))
+            elif arguments.command == "overlay":
+                sentence = overlay_command.run(arguments, progress)
+                progress.clear()
+                print(sentence)
             else:
                 _reconstruct(arguments, progress)
     except ReconstructionError as error:
@@ -226,4 +231,12 @@ def _parser() -> argparse.ArgumentParser:
         description="Write a result for another tool.",
     )
     export_command.add_arguments(export_parser)
+
+    overlay_parser = commands.add_parser(
+        "overlay",
+        parents=[common],
+        help="write the footage with points, a grid and cubes locked into the scene",
+        description="Write the footage as a video with points, a grid and cubes locked into the scene.",
+    )
+    overlay_command.add_arguments(overlay_parser)
     return parser
