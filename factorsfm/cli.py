@@ -20,6 +20,7 @@ from factorsfm.export.folder import check_directory, write_failure, write_folder
 from factorsfm.frames import parse_range
 from factorsfm.options import PRESETS
 from factorsfm.priors.depth import DepthKind
+from factorsfm.report import command as overlay_command
 from factorsfm.stream_command import unless_none
 from factorsfm.summary import conclusion, program_version
 
@@ -44,6 +45,10 @@ def main(argv: Sequence[str] | None = None) -> int:
                 print(export_command.run(arguments))
             elif arguments.command == "stream":
                 print(stream_command.run(arguments, progress, progress.show))
+            elif arguments.command == "overlay":
+                sentence = overlay_command.run(arguments, progress)
+                progress.clear()
+                print(sentence)
             else:
                 _reconstruct(arguments, progress)
     except ReconstructionError as error:
@@ -221,6 +226,14 @@ def _parser() -> argparse.ArgumentParser:
         description="Write a result for another tool.",
     )
     export_command.add_arguments(export_parser)
+
+    overlay_parser = commands.add_parser(
+        "overlay",
+        parents=[common],
+        help="write the footage with points, a grid and cubes locked into the scene",
+        description="Write the footage as a video with points, a grid and cubes locked into the scene.",
+    )
+    overlay_command.add_arguments(overlay_parser)
     return parser
 
 

@@ -74,10 +74,10 @@ class Cli:
         assert snapshot(self.folder) == before
 
     def fails(self, words: str, source: Path | str, *arguments: Path | str) -> dict[str, Any]:
-        """Exit status 3; returns the summary, which is all that is written."""
+        """Exit status 3; only the summary, which is returned, and the report are written."""
         assert self.run(source, *arguments) == 3
         self.one_line(words)
-        assert [path.name for path in self.output.iterdir()] == ["summary.json"]
+        assert {path.name for path in self.output.iterdir()} == {"summary.json", "report.html"}
         summary = json.loads((self.output / "summary.json").read_text())
         assert summary["reconstructed"] is False
         assert words in summary["reason"]

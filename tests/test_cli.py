@@ -164,7 +164,7 @@ def test_a_shot_that_cannot_be_reconstructed_leaves_the_reason(
     out = tmp_path / "out"
     assert main(["reconstruct", "shot.mp4", "--output", str(out), "--preset", "geometry"]) == 3
     assert_one_error_line(capsys.readouterr(), "12 tracks found, 30 needed")
-    assert [p.name for p in out.iterdir()] == ["summary.json"]
+    assert {p.name for p in out.iterdir()} == {"summary.json", "report.html"}
     summary = json.loads((out / "summary.json").read_text())
     assert summary["reason"] == "12 tracks found, 30 needed"
     assert (summary["source"], summary["options"]["preset"]) == ("shot.mp4", "geometry")

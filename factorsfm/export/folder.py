@@ -15,7 +15,7 @@ from factorsfm.export.colmap import write_colmap
 from factorsfm.export.ply import write_ply
 from factorsfm.export.trajectory import write_trajectory
 from factorsfm.reconstruction import FrameResult, Reconstruction
-from factorsfm.report.page import report_html
+from factorsfm.report.page import failure_html, report_html
 from factorsfm.summary import PROGRAM, failure_summary, json_text, summary
 
 # Whatever an earlier result may have left; picture.png is drawn by the demo.
@@ -45,13 +45,15 @@ def write_failure(
     options: Mapping[str, Any] | None = None,
     seconds: Mapping[str, float] | None = None,
 ) -> None:
-    """Write a summary.json that says why the shot cannot be reconstructed; an earlier result is removed.
+    """Write a summary.json and a report.html that say why the shot cannot be reconstructed; an earlier result goes.
 
     Raises:
         InputError: the directory cannot be written, or holds something else than an earlier result.
     """
     with _complete_or_nothing(Path(directory)) as folder:
-        content = failure_summary(reason, frames, options or {}, seconds or {})
+        options, seconds = options or {}, seconds or {}
+        (folder / "report.html").write_text(failure_html(reason, frames, options, seconds), encoding="utf-8")
+        content = failure_summary(reason, frames, options, seconds)
         (folder / "summary.json").write_text(json_text(content), encoding="utf-8")
 
 

@@ -2,104 +2,123 @@
 
 from __future__ import annotations
 
-import base64
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from html import escape
+from importlib.metadata import PackageNotFoundError, version
 from importlib.resources import files
+from platform import python_version
 from string import Template
 from typing import Any
 
-import numpy as np
+from factorsfm.reconstruction import FrameResult, Reconstruction
+from factorsfm.report.data import frames_data, reconstruction_data
+from factorsfm.report.wording import (
+    explanation,
+    failure_sentence,
+    grade,
+    status_words,
+    verdict_sentence,
+)
+from factorsfm.summary import PROGRAM, json_text, program_version, with_total
 
-from factorsfm.reconstruction import FrameStatus, Reconstruction
-from factorsfm.report.geometry import median_prior_residuals, scene
-from factorsfm.summary import json_text, program_version, verdict, with_total
-
-_MAX_POINTS = 20_000
+_SCRIPTS = ("base.js", "view.js", "footage.js", "charts.js", "page.js")
+_LIBRARIES = ("gtsam", "pycolmap", "opencv-python-headless", "onnxruntime", "numpy")
 
 
 def report_html(reconstruction: Reconstruction) -> str:
     """The report as one self-contained HTML document: styles, scripts and data are inside, no network."""
-    template = Template(files("factorsfm.report").joinpath("template.html").read_text(encoding="utf-8"))
-    source = reconstruction.options.get("source")
-    sentence = verdict(reconstruction)
-    return template.substitute(
-        title=escape(f"{source} – factorsfm report" if source else "factorsfm report"),
-        source=escape(str(source)) if source else "Reconstruction",
-        verdict=escape(sentence[0].upper() + sentence[1:] + "."),
-        notes="".join(f"<li>{escape(note)}</li>" for note in reconstruction.notes),
+    return _document(
+        grade=grade(reconstruction),
+        verdict=verdict_sentence(reconstruction),
+        explanation=" ".join(explanation(reconstruction)),
+        notes=reconstruction.notes,
         facts=_facts(reconstruction),
-        unregistered=_unregistered(reconstruction),
-        timings=_table({stage: f"{value:.2f} s" for stage, value in with_total(reconstruction.seconds).items()}),
-        options=_table(_flat(reconstruction.options)),
-        version=escape(program_version()),
-        # "</" would end the script element
-        data=json_text(_data(reconstruction), indent=None).replace("</", "<\\/"),
+        frames=reconstruction.frames,
+        seconds=reconstruction.seconds,
+        options=reconstruction.options,
+        data=reconstruction_data(reconstruction),
     )
 
 
-def _data(reconstruction: Reconstruction) -> dict[str, Any]:
-    """What the script draws; arrays as base64 of little-endian values."""
-    view = scene(reconstruction, _MAX_POINTS)
-    frames = reconstruction.frames
-    priors = [frame.prior for frame in frames]
-    return {
-        "metric": reconstruction.metric,
-        "aspect": reconstruction.camera.height / reconstruction.camera.width,
-        "half_width": reconstruction.camera.width / 2 / reconstruction.camera.focal_length_x,
-        "points": _base64(view.points, "<f4"),
-        "colors": _base64(view.colors, "u1"),
-        "centers": _base64(view.centers, "<f4"),
-        "rotations": _base64(view.rotations, "<f4"),
-        "camera_frames": view.frames,
-        "frame": [frame.index for frame in frames],
-        "registered": [int(frame.registered) for frame in frames],
-        "keyframe": [int(frame.keyframe) for frame in frames],
-        "observations": [frame.observations for frame in frames],
-        "inliers": [frame.inliers for frame in frames],
-        "error": _short([frame.reprojection_error for frame in frames]),
-        "residual": _short(100 * median_prior_residuals(reconstruction)),
-        "scale": _short([prior.scale if prior else np.nan for prior in priors]),
-        "scale_std": _short([prior.scale_std if prior else np.nan for prior in priors]),
-        "shift": _short([prior.shift if prior else np.nan for prior in priors]),
-        "shift_std": _short([prior.shift_std if prior else np.nan for prior in priors]),
-    }
+def failure_html(
+    reason: str, frames: Sequence[FrameResult], options: Mapping[str, Any], seconds: Mapping[str, float]
+) -> str:
+    """The report of a shot that could not be reconstructed: why, and what became of each frame."""
+    return _document(
+        grade="Not solved",
+        verdict=f"The camera of this shot could not be solved: {reason.rstrip('.')}.",
+        explanation=failure_sentence(frames),
+        notes=[],
+        facts={"Frames": len(frames)},
+        frames=frames,
+        seconds=seconds,
+        options=options,
+        data=frames_data(frames),
+    )
 
 
-def _facts(reconstruction: Reconstruction) -> str:
+def _document(
+    *,
+    grade: str,
+    verdict: str,
+    explanation: str,
+    notes: Sequence[str],
+    facts: Mapping[str, Any],
+    frames: Sequence[FrameResult],
+    seconds: Mapping[str, float],
+    options: Mapping[str, Any],
+    data: Mapping[str, Any],
+) -> str:
+    source = options.get("source")
+    return Template(_file("page.html")).substitute(
+        title=escape(f"{source} – {PROGRAM} report" if source else f"{PROGRAM} report"),
+        source=escape(str(source)) if source else "Reconstruction",
+        grade=escape(grade),
+        mark=grade.lower().replace(" ", "-"),
+        verdict=escape(verdict),
+        explanation=escape(explanation),
+        notes="".join(f"<li>{escape(note)}</li>" for note in notes),
+        facts="".join(f"<div><dt>{key}</dt><dd>{escape(str(value))}</dd></div>" for key, value in facts.items()),
+        statuses=_statuses(frames),
+        timings=_table({stage: f"{value:.2f} s" for stage, value in with_total(seconds).items()}),
+        versions=_table(_versions()),
+        options=_table(_flat(options)),
+        style=_file("page.css"),
+        # "</" would end the script element
+        data=json_text(data, indent=None).replace("</", "<\\/"),
+        script="".join(_file(name) for name in _SCRIPTS),
+    )
+
+
+def _facts(reconstruction: Reconstruction) -> dict[str, Any]:
     camera = reconstruction.camera
-    facts = {
-        "Frames registered": f"{len(reconstruction.registered)} / {len(reconstruction.frames)}",
+    return {
+        "Frames solved": f"{len(reconstruction.registered)} / {len(reconstruction.frames)}",
         "Keyframes": sum(frame.keyframe for frame in reconstruction.frames),
         "Points": f"{len(reconstruction.points):,}",
         "Observations": f"{len(reconstruction.observation_point):,}",
         "Parallax": f"{reconstruction.parallax:.3f}",
         "Motion": reconstruction.kind,
-        "Scale": "metres" if reconstruction.metric else "arbitrary",
+        "Scale": "metres" if reconstruction.metric else "free",
         "Focal length": f"{camera.mean_focal_length():.1f} px",
         "Lens": f"{camera.model_name} {camera.width}×{camera.height}",
     }
-    return "".join(f"<div><dt>{key}</dt><dd>{escape(str(value))}</dd></div>" for key, value in facts.items())
 
 
-def _unregistered(reconstruction: Reconstruction) -> str:
-    missing = [frame for frame in reconstruction.frames if not frame.registered]
+def _statuses(frames: Sequence[FrameResult]) -> str:
+    missing = [frame for frame in frames if not frame.registered]
     if not missing:
-        return "<p>Every frame is registered.</p>"
+        return "<p>Every frame is solved.</p>" if frames else "<p>No frame was read.</p>"
     rows = "".join(
         f"<tr><td>{frame.index}</td><td>{escape(frame.name)}</td>"
-        f"<td>{_words(frame.status)}</td><td>{escape(frame.message)}</td></tr>"
+        f"<td>{status_words(frame.status)}</td><td>{escape(frame.message)}</td></tr>"
         for frame in missing
     )
     return (
-        '<div class="scroll"><table><thead><tr><th scope="col">Frame</th><th scope="col">Name</th>'
-        '<th scope="col">Status</th><th scope="col">Reason</th></tr></thead>'
-        f"<tbody>{rows}</tbody></table></div>"
+        '<div class="scroll tall" tabindex="0" role="region" aria-label="Frames that are not solved"><table><thead><tr>'
+        '<th scope="col">Frame</th><th scope="col">Name</th><th scope="col">Status</th><th scope="col">Reason</th>'
+        f"</tr></thead><tbody>{rows}</tbody></table></div>"
     )
-
-
-def _words(status: FrameStatus) -> str:
-    return status.value.replace("_", " ")
 
 
 def _table(values: Mapping[str, Any]) -> str:
@@ -107,6 +126,16 @@ def _table(values: Mapping[str, Any]) -> str:
         f'<tr><th scope="row">{escape(key)}</th><td>{escape(str(value))}</td></tr>' for key, value in values.items()
     )
     return f'<div class="scroll"><table><tbody>{rows}</tbody></table></div>' if rows else "<p>None.</p>"
+
+
+def _versions() -> dict[str, str]:
+    found = {PROGRAM: program_version(), "Python": python_version()}
+    for name in _LIBRARIES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:  # another build of the same library
+            continue
+    return found
 
 
 def _flat(options: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -120,10 +149,5 @@ def _flat(options: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def _base64(values: Any, dtype: str) -> str:
-    return base64.b64encode(np.asarray(values).astype(dtype).tobytes()).decode("ascii")
-
-
-def _short(values: Any) -> list[float]:
-    """Five significant digits are enough to draw."""
-    return [float(f"{value:.5g}") for value in np.asarray(values, float)]
+def _file(name: str) -> str:
+    return files("factorsfm.report").joinpath(name).read_text(encoding="utf-8")

@@ -1,0 +1,84 @@
+"""What the script of the report draws: plain data, arrays as base64 of little-endian values."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorsfm.reconstruction import FrameResult, Reconstruction
+from factorsfm.report.charts import charts
+from factorsfm.report.geometry import Tracks, median_prior_residuals, scene, tracks
+from factorsfm.report.wording import status_words
+
+_MAX_POINTS = 20_000
+_MAX_OBSERVATIONS = 150_000
+_RESIDUAL_STEPS = 256  # per pixel
+_PRIOR_STEPS = 10_000  # per 100 %
+_NONE = -(2**15)
+
+
+def reconstruction_data(reconstruction: Reconstruction) -> dict[str, Any]:
+    """Everything that the report of a reconstruction draws."""
+    view = scene(reconstruction, _MAX_POINTS)
+    camera = reconstruction.camera
+    unit = "m" if reconstruction.metric else "units"
+    return {
+        **frames_data(reconstruction.frames, median_prior_residuals(reconstruction), unit),
+        "unit": unit,
+        "width": camera.width,
+        "height": camera.height,
+        "focal": camera.focal_length_x,
+        "points": _base64(view.points, "<f4"),
+        "colors": _base64(view.colors, "u1"),
+        "centers": _base64(view.centers, "<f4"),
+        "rotations": _base64(view.rotations, "<f4"),
+        "positions": view.positions,
+        "tracks": _tracks_data(
+            tracks(reconstruction, view, _MAX_OBSERVATIONS), len(reconstruction.frames), camera.width, camera.height
+        ),
+    }
+
+
+def frames_data(
+    frames: Sequence[FrameResult], prior_residual: NDArray[np.float64] | None = None, unit: str = "units"
+) -> dict[str, Any]:
+    """What is known of the frames, also of those of a shot that failed."""
+    if prior_residual is None:
+        prior_residual = np.full(len(frames), np.nan)
+    return {
+        "frame": [frame.index for frame in frames],
+        "name": [frame.name for frame in frames],
+        "timestamp": [frame.timestamp for frame in frames],
+        "status": [status_words(frame.status) for frame in frames],
+        "message": [frame.message for frame in frames],
+        "registered": [frame.registered for frame in frames],
+        "keyframe": [frame.keyframe for frame in frames],
+        "thumbnail": [base64.b64encode(frame.thumbnail).decode() if frame.thumbnail else None for frame in frames],
+        "charts": [chart.to_data() for chart in charts(frames, prior_residual, unit)],
+    }
+
+
+def _tracks_data(found: Tracks, frames: int, width: int, height: int) -> dict[str, Any]:
+    """Places as 16-bit fractions of the image, residuals and the prior's relative residuals as 16-bit steps."""
+    place = (found.xy + 0.5) / [width, height]
+    return {
+        "start": np.searchsorted(found.position, np.arange(frames + 1)),
+        "point": _base64(found.point, "<u2"),
+        "place": _base64(np.clip(np.round(65535 * place), 0, 65535), "<u2"),
+        "residual": _base64(_steps(found.residual, _RESIDUAL_STEPS), "<i2"),
+        "residual_steps": _RESIDUAL_STEPS,
+        "prior": _base64(_steps(found.prior_residual, _PRIOR_STEPS), "<i2"),
+        "prior_steps": _PRIOR_STEPS,
+    }
+
+
+def _steps(values: NDArray[np.float64], per_unit: int) -> NDArray[np.float64]:
+    return np.where(np.isfinite(values), np.clip(np.round(per_unit * values), 1 - 2**15, 2**15 - 1), _NONE)
+
+
+def _base64(values: NDArray[Any], dtype: str) -> str:
+    return base64.b64encode(values.astype(dtype).tobytes()).decode("ascii")

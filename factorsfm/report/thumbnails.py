@@ -1,0 +1,61 @@
+"""Small pictures of the frames for the report, in bounded memory."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from factorsfm.reconstruction import FrameResult
+
+_WIDTH = 384
+_QUALITY = 60  # of JPEG
+_MOST = 240  # about 4 MB
+
+
+class Thumbnails:
+    """Small JPEGs of a stream of frames: of every frame, of a longer shot of every second, fourth, ... one.
+
+    Example:
+        >>> thumbnails = Thumbnails()
+        >>> thumbnails.add(np.zeros((270, 480, 3), np.uint8))
+        >>> len(thumbnails.by_frame())
+        1
+    """
+
+    def __init__(self, most: int = _MOST) -> None:
+        self._most = most
+        self._kept: dict[int, bytes] = {}
+        self._added = 0
+        self._step = 1
+
+    def add(self, image: NDArray[np.uint8]) -> None:
+        """Take the next frame, (h, w, 3) BGR or (h, w) grey."""
+        if self._added % self._step == 0:
+            self._kept[self._added] = thumbnail(image)
+        self._added += 1
+        if len(self._kept) > self._most:
+            self._step *= 2
+            self._kept = {position: jpeg for position, jpeg in self._kept.items() if position % self._step == 0}
+
+    def by_frame(self) -> list[bytes | None]:
+        """One entry per frame that was added, None where none is kept."""
+        return [self._kept.get(position) for position in range(self._added)]
+
+    def attach(self, frames: Sequence[FrameResult]) -> None:
+        """Give the frames their thumbnails; they are those that were added, in the same order."""
+        for frame, jpeg in zip(frames, self.by_frame(), strict=True):
+            frame.thumbnail = jpeg
+
+
+def thumbnail(image: NDArray[np.uint8]) -> bytes:
+    """A JPEG, 384 pixels wide or as wide as the image where that is smaller."""
+    height, width = image.shape[:2]
+    if width > _WIDTH:
+        image = np.asarray(
+            cv2.resize(image, (_WIDTH, max(1, round(height * _WIDTH / width))), interpolation=cv2.INTER_AREA)
+        )
+    _, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    return jpeg.tobytes()

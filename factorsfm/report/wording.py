@@ -1,0 +1,93 @@
+"""What a result means, in the words of those who use it: no jargon of the estimator."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+
+from factorsfm.reconstruction import FrameResult, FrameStatus, Reconstruction, ShotKind
+from factorsfm.summary import median_reprojection_error
+
+_NO_SHARE = 0.05  # of the depth prior, below which it is not worth a word
+_STATUS = {
+    "registered": "solved",
+    "static": "solved, camera at rest",
+    "too_few_tracks": "too little to track",
+    "too_few_inliers": "tracks contradict the scene",
+    "blank": "blank or out of focus",
+    "waiting": "before the solve could start",
+    "unusable": "image cannot be used",
+}
+
+
+def status_words(status: FrameStatus) -> str:
+    return _STATUS.get(status.value, status.value.replace("_", " "))
+
+
+def grade(reconstruction: Reconstruction) -> str:
+    """The verdict in one to three words."""
+    if not reconstruction.registered:
+        return "Not solved"
+    if len(reconstruction.registered) < len(reconstruction.frames):
+        return "Solved in part"
+    return "Solved"
+
+
+def verdict_sentence(reconstruction: Reconstruction) -> str:
+    """What has been solved and how well it sits on the footage, in one sentence."""
+    frames, solved = len(reconstruction.frames), len(reconstruction.registered)
+    where = f"all {frames} frames" if solved == frames else f"{solved} of {frames} frames"
+    sentence = f"The camera is solved in {where}"
+    error = median_reprojection_error(reconstruction)
+    if np.isfinite(error):
+        sentence += f", and half of the tracked points land within {error:.2f} pixels of where the footage shows them"
+    return sentence + "."
+
+
+def explanation(reconstruction: Reconstruction) -> list[str]:
+    """What one can do with the solve, sentence by sentence."""
+    sentences = [_motion(reconstruction)]
+    known = [frame.observability for frame in reconstruction.registered if frame.observability is not None]
+    slide = _largest([item.pixel_slide for item in known])
+    if slide is not None:
+        sentences.append(
+            f"An object placed in the scene may slide by up to {slide:.2f} pixels against the footage (1σ)."
+        )
+    share = _largest([item.prior_share for item in known])
+    if share is not None and reconstruction.kind is ShotKind.GENERAL:
+        if share < _NO_SHARE:
+            sentences.append("Where the camera stands follows from parallax alone.")
+        else:
+            sentences.append(
+                f"Up to {100 * share:.0f} % of what is known of the camera's position comes from the depth prior, "
+                "the rest from parallax."
+            )
+    if reconstruction.metric:
+        sentences.append("Lengths are in metres, as far as the depth prior is right.")
+    else:
+        sentences.append("The size of the scene is free: scale it by a length that you know.")
+    return sentences
+
+
+def failure_sentence(frames: Sequence[FrameResult]) -> str:
+    """What became of the frames of a shot that could not be solved."""
+    counts = Counter(frame.status for frame in frames).most_common()
+    found = "; ".join(f"{n} {'frame' if n == 1 else 'frames'}: {status_words(status)}" for status, n in counts)
+    return f"{found}." if found else "No frame was read."
+
+
+def _motion(reconstruction: Reconstruction) -> str:
+    if not reconstruction.registered:
+        return "No frame could be solved."
+    if reconstruction.kind is ShotKind.STATIC:
+        return "The camera is locked off: one pose holds for every frame."
+    if reconstruction.kind is ShotKind.ROTATION:
+        return "The camera only turns: use it as a nodal pan, without parallax."
+    return f"The camera travels {100 * reconstruction.parallax:.2g} % of the distance to the scene."
+
+
+def _largest(values: Sequence[float]) -> float | None:
+    finite = [value for value in values if np.isfinite(value)]
+    return max(finite) if finite else None
