@@ -237,8 +237,11 @@ def test_verdict_for_compositors() -> None:
         text = " ".join(explanation(reconstruction))
         assert words in text
         assert "may slide by up to 0.12 pixels" in text
+    reconstruction.observation_error = reconstruction.observation_error + 2
+    assert explanation(reconstruction)[0].startswith("That is too far")
+    assert ">Doubtful</span>" in report_html(reconstruction)
     turning = replace(reconstruction, kind=ShotKind.ROTATION, metric=True)
-    assert "only turns" in explanation(turning)[0]
+    assert "only turns" in explanation(turning)[1]
     assert "parallax alone" not in " ".join(explanation(turning))
     assert explanation(turning)[-1].startswith("Lengths are in metres")
 

@@ -5,7 +5,7 @@ const css = name => getComputedStyle(document.documentElement).getPropertyValue(
 const typed = (text, Type) => new Type(Uint8Array.from(atob(text || ""), c => c.charCodeAt(0)).buffer);
 const clamp = (x, low, high) => Math.min(high, Math.max(low, x));
 const quantile = (sorted, q) => sorted.length ? sorted[Math.round(q * (sorted.length - 1))] : 0;
-const format = x => x === null ? "–" : Number(x.toPrecision(4)).toString();
+const format = x => x === null ? "–" : x && Math.abs(x) < 1e-3 ? Number(x.toPrecision(3)).toExponential() : Number(x.toPrecision(4)).toString();
 const roundLength = most => [5, 2, 1].map(f => f * 10 ** Math.floor(Math.log10(most))).find(l => l <= most * 1.0001);
 
 const frameCount = data.frame.length, last = Math.max(frameCount - 1, 1);

@@ -170,8 +170,10 @@ function drawStrip() {
     context.fillRect(k * step, tall, Math.max(step, 1), bar);
   }
   context.globalAlpha = 1;
-  context.fillStyle = css("--ink");
-  context.fillRect((seek.position + 0.5) * step - ratio, 0, 2 * ratio, height);
+  for (const [color, wide] of [["#000", 4], ["#fff", 2]]) {
+    context.fillStyle = color;
+    context.fillRect((seek.position + 0.5) * step - wide * ratio / 2, 0, wide * ratio, height);
+  }
 }
 
 const drawFootageAll = () => { drawFootage(); drawDepths(); drawStrip(); };

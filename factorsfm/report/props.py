@@ -20,7 +20,8 @@ _GROUND_SLOPE = np.cos(np.radians(35))  # between a ground's normal and the came
 _GROUND_SHARE, _ANY_SHARE = 0.12, 0.2  # of the points that must support a ground, or any plane
 _FEWEST = 15
 _BREADTH = 0.12  # of the supporting points across their longest direction: a line supports every plane through it
-_CELLS = 6  # along the longer side of the grid, at least
+_CELL = 0.1  # side of a cell as a share of the picture's width, at most, at the typical distance of the plane
+_MOST_CELLS = 40  # along a side of the grid
 _CUBES = 3
 _CENTRAL = 0.7  # share of the width and height of the picture in which the cubes start
 
@@ -73,8 +74,10 @@ def place_props(reconstruction: Reconstruction) -> Props:
         InputError: there is no camera or there are too few points.
     """
     plane = find_plane(reconstruction)
-    size = plane.extent[1] - plane.extent[0]
-    cell = _round_length(float(size.max()) / _CELLS)
+    camera = reconstruction.camera
+    away = np.linalg.norm(reconstruction.points[plane.support] - reconstruction.camera_centers().mean(axis=0), axis=1)
+    seen = _CELL * float(np.median(away)) * camera.width / camera.focal_length_x
+    cell = _round_length(max(seen, 2 * float(np.ptp(plane.extent, axis=0).max()) / _MOST_CELLS))
     low, high = np.floor(plane.extent[0] / cell), np.ceil(plane.extent[1] / cell)
     along, across = (np.arange(a, b + 1) * cell for a, b in zip(low, high, strict=True))
     steps = np.linspace(0, 1, 65)

@@ -34,12 +34,14 @@ function look(name) {
     }).sort();
     return [quantile(slopes, trim), quantile(slopes, 1 - trim)];
   };
-  for (let round = 0; round < 12; round++) {
+  const some = points.filter((_, i) => Math.floor(i / 3) % Math.ceil(pointCount / 1000) === 0);
+  for (let round = 0; round < 25; round++) {
     const spans = [0, 1].map(axis => {
-      const path = span(centers, axis, 0), scattered = name === "path" || !pointCount ? path : span(points, axis, 0.02);
+      const path = span(centers, axis, 0), scattered = name === "path" || !pointCount ? path : span(some, axis, 0.02);
       return [Math.min(path[0], scattered[0]), Math.max(path[1], scattered[1])];
     });
-    scene.target = scene.target.map((t, k) => t + spans.reduce((sum, [low, high], axis) => sum + scene.distance * axes[axis][k] * (low + high) / 2, 0));
+    // half of what would be right if everything were as far away as the target: near things move more
+    scene.target = scene.target.map((t, k) => t + spans.reduce((sum, [low, high], axis) => sum + scene.distance * axes[axis][k] * (low + high) / 4, 0));
     const filled = Math.max(...spans.map(([low, high], axis) => FOCAL * Math.min(...size) * (high - low) / (0.88 * size[axis])));
     let before = 0; // how far the path comes towards the viewer
     for (let k = 0; k < cameraCount; k++) before = Math.max(before, -dot(axes[2], scene.target.map((t, axis) => centers[3 * k + axis] - t)));

@@ -10,6 +10,7 @@ import numpy as np
 from factorsfm.reconstruction import FrameResult, FrameStatus, Reconstruction, ShotKind
 from factorsfm.summary import median_reprojection_error
 
+_DOUBTFUL_PX = 1.0  # median reprojection error; tracks are good to a tenth of a pixel
 _NO_SHARE = 0.05  # of the depth prior, below which it is not worth a word
 _STATUS = {
     "registered": "solved",
@@ -30,6 +31,8 @@ def grade(reconstruction: Reconstruction) -> str:
     """The verdict in one to three words."""
     if not reconstruction.registered:
         return "Not solved"
+    if _is_doubtful(reconstruction):
+        return "Doubtful"
     if len(reconstruction.registered) < len(reconstruction.frames):
         return "Solved in part"
     return "Solved"
@@ -49,6 +52,8 @@ def verdict_sentence(reconstruction: Reconstruction) -> str:
 def explanation(reconstruction: Reconstruction) -> list[str]:
     """What one can do with the solve, sentence by sentence."""
     sentences = [_motion(reconstruction)]
+    if _is_doubtful(reconstruction):
+        sentences.insert(0, "That is too far: the tracks contradict each other, or the scene moves by itself.")
     known = [frame.observability for frame in reconstruction.registered if frame.observability is not None]
     slide = _largest([item.pixel_slide for item in known])
     if slide is not None:
@@ -76,6 +81,10 @@ def failure_sentence(frames: Sequence[FrameResult]) -> str:
     counts = Counter(frame.status for frame in frames).most_common()
     found = "; ".join(f"{n} {'frame' if n == 1 else 'frames'}: {status_words(status)}" for status, n in counts)
     return f"{found}." if found else "No frame was read."
+
+
+def _is_doubtful(reconstruction: Reconstruction) -> bool:
+    return median_reprojection_error(reconstruction) > _DOUBTFUL_PX
 
 
 def _motion(reconstruction: Reconstruction) -> str:
