@@ -39,6 +39,7 @@ from factorsfm.reading import read_depth, read_mask
 from factorsfm.reconstruction import FrameResult, FrameStatus, Reconstruction
 from factorsfm.registration import ImageDepth
 from factorsfm.relocalization import Relocalizer
+from factorsfm.report.thumbnails import Thumbnails
 from factorsfm.result import assemble
 from factorsfm.snapshot import read_snapshot, write_snapshot
 from factorsfm.tracks.flow import FlowTracker
@@ -136,6 +137,7 @@ class Stream:
         self._masks = masks
         self._tracker = FlowTracker(self.options.tracker)
         self._relocalizer = Relocalizer()
+        self._thumbnails = Thumbnails()
         self._mapper: Mapper | None = None
         self._size = (0, 0)
         self._colors = np.zeros((0, 3), np.uint8)
@@ -177,6 +179,7 @@ class Stream:
             image = mapper.add(tracks, lambda: self._read_depth(frame, pixels))
         self.frames.append(SeenFrame(frame.index, frame.name, frame.timestamp, tracked.texture))
         self._pixels.append(pixels)
+        self._thumbnails.add(frame.image)
         self._tracker.drop(mapper.outliers)
         with self._timed("relocalization"):
             self._keep_in_sight(image, grey, pixels)
@@ -225,6 +228,7 @@ class Stream:
                 "frames": [astuple(frame) for frame in self.frames],
                 "tracker": self._tracker.state(),
                 "views": self._relocalizer.views,
+                "thumbnails": self._thumbnails.state(),
                 "next_view": self._relocalizer.next_view,
                 "mapper": self._mapper.state() if self._mapper is not None else None,
             },
@@ -257,6 +261,7 @@ class Stream:
         self.frames = [SeenFrame(*frame) for frame in state["frames"]]
         self._tracker.restore(state["tracker"])
         self._relocalizer = Relocalizer(state["views"], state["next_view"])
+        self._thumbnails.restore(state["thumbnails"])
         if state["mapper"] is not None:
             self._mapper = self._new_mapper()
             self._mapper.restore(state["mapper"])
@@ -306,6 +311,7 @@ class Stream:
         if self._without_depth:
             count, first = len(self._without_depth), self._without_depth[0]
             reconstruction.notes.append(f"Frames that went without depth because the prior failed: {count}; {first}.")
+        self._thumbnails.attach(reconstruction.frames)
         return reconstruction
 
     def close(self) -> None:
@@ -390,6 +396,7 @@ class Stream:
             )
             for frame, image in zip(self.frames, images, strict=True)
         ]  # fmt: skip
+        self._thumbnails.attach(frames)
         return ReconstructionError(message, frames)
 
     def _read_depth(self, frame: Frame, xy: NDArray[np.float64]) -> ImageDepth | None:

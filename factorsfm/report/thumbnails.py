@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import cv2
 import numpy as np
@@ -43,6 +44,16 @@ class Thumbnails:
     def by_frame(self) -> list[bytes | None]:
         """One entry per frame that was added, None where none is kept."""
         return [self._kept.get(position) for position in range(self._added)]
+
+    def state(self) -> dict[str, Any]:
+        """Everything that `restore` needs."""
+        kept = {position: np.frombuffer(jpeg, np.uint8) for position, jpeg in self._kept.items()}
+        return {"kept": kept, "added": self._added, "step": self._step}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go on where `state` was taken."""
+        self._kept = {position: jpeg.tobytes() for position, jpeg in state["kept"].items()}
+        self._added, self._step = state["added"], state["step"]
 
     def attach(self, frames: Sequence[FrameResult]) -> None:
         """Give the frames their thumbnails; they are those that were added, in the same order."""
