@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from bisect import bisect_left
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
@@ -185,13 +186,20 @@ class Mapper:
         return start_pair(images, o.min_tracks, focal=self.focal, sigma=o.pixel_sigma, inlier_px=o.inlier_px)
 
     def _start_essential(self, angle_deg: float) -> Start | NoStart:
-        """The first waiting image and the last one; with no angle asked for, the partner with most parallax."""
+        """The first waiting image and the last one; with no angle asked for, the partner with most parallax.
+
+        First is the first one that has not lost its tracks since, as in a fade.
+        """
         o = self.options
         waiting = [image.tracks for image in self._waiting()]
         if len(waiting) < 2:
             return NoStart(f"{len(waiting)} of 2 needed images")
-        first = waiting[0]
-        partners = waiting[-1:] if angle_deg > 0.0 else sorted(waiting[1:], key=lambda t: -median_flow(first, t))[:5]
+        sharing = bisect_left(waiting[:-1], o.min_tracks, key=lambda t: _shared(t, waiting[-1]))  # ever more do
+        first = waiting[sharing] if sharing < len(waiting) - 1 else waiting[0]
+        partners = waiting[-1:]
+        if angle_deg <= 0.0:
+            partners = [t for t in waiting if t is not first and _shared(first, t) >= o.min_tracks]
+            partners = sorted(partners, key=lambda t: -median_flow(first, t))[:5]
         start: Start | NoStart = NoStart("no partner")
         for second in partners:
             start = start_essential(
@@ -413,6 +421,10 @@ class Mapper:
                 relative = turn @ before[0].T
                 image.rotation = relative @ rotation
                 image.translation = relative @ (translation - before[1]) + shift
+
+
+def _shared(a: ImageTracks, b: ImageTracks) -> int:
+    return int(np.isin(a.ids, b.ids, assume_unique=True).sum())
 
 
 def _select(depth: ImageDepth, index: NDArray[np.bool_]) -> ImageDepth:
