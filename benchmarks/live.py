@@ -14,6 +14,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 
 from benchmarks.inputs import open_prior, open_shot
@@ -31,7 +32,7 @@ Array = NDArray[np.float64]
 _COLUMNS = (("ATE", 0.002), ("ATE", 0.02), ("T-RPE", 0.001), ("T-RPE", 0.005), ("R-RPE", 0.02), ("R-RPE", 0.1))
 _HEADER = ["ATE 0.2 cm", "ATE 2 cm", "T-RPE 0.1 cm", "T-RPE 0.5 cm", "R-RPE 0.02°", "R-RPE 0.1°"]
 _WARM_UP = 500  # frames of the long stream after which memory is measured
-_SIGMAS = 5.0
+SIGMAS = 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,22 +84,40 @@ def measure(shot: Shot, data: Path, models: Path, cache: Path) -> Measured:
 
 
 def _inside(updates: Sequence[FrameUpdate], shot: Shot) -> NDArray[np.bool_]:
-    """Poses relative to the first camera, with the one scale that is free, against their covariance."""
-    rotations, centers = pose_arrays([update.cam_from_world for update in updates])
+    poses, covariances = zip(*((update.cam_from_world, update.covariance) for update in updates), strict=True)
+    return sigmas(poses, covariances, shot.rotations, shot.centers)[1:] < SIGMAS
+
+
+def sigmas(
+    poses: Sequence[pycolmap.Rigid3d | None], covariances: Sequence[Array | None], rotations: Array, centers: Array
+) -> Array:
+    """How far poses are from the truth, in standard deviations: the larger one of rotation and translation.
+
+    They are taken relative to the first one, with the one scale that is free.
+
+    Args:
+        poses, covariances: n of them, None where there is none; the first one is there.
+        rotations, centers: (n, 3, 3) and (n, 3), the truth.
+
+    Returns:
+        (n,), NaN where there is no pose; 0 for the first one.
+    """
+    found_rotations, found_centers = _relative(*pose_arrays(poses))
     rotations, centers = _relative(rotations, centers)
-    true_rotations, true_centers = _relative(shot.rotations, shot.centers)
     settled = slice(len(centers) // 3, None)
-    scale = np.nansum(centers[settled] * true_centers[settled]) / np.nansum(true_centers[settled] ** 2)
-    inside = []
-    for k, update in list(enumerate(updates))[1:]:
-        if update.covariance is None:
-            inside.append(False)
+    valid = np.isfinite(found_centers[settled, 0])
+    true = centers[settled][valid]
+    scale = np.sum(found_centers[settled][valid] * true) / np.sum(true**2)
+    found = np.full(len(poses), np.nan)
+    found[0] = 0.0
+    for k, covariance in list(enumerate(covariances))[1:]:
+        if covariance is None or not np.isfinite(found_centers[k, 0]):
             continue
-        turn = cv2.Rodrigues(rotations[k].T @ true_rotations[k])[0].ravel()
-        move = rotations[k].T @ (scale * true_centers[k] - centers[k])
-        parts = ((turn, update.covariance[:3, :3]), (move, update.covariance[3:, 3:]))
-        inside.append(all(error @ np.linalg.solve(c, error) < _SIGMAS**2 for error, c in parts))
-    return np.array(inside)
+        turn = cv2.Rodrigues(found_rotations[k].T @ rotations[k])[0].ravel()
+        move = found_rotations[k].T @ (scale * centers[k] - found_centers[k])
+        parts = ((turn, covariance[:3, :3]), (move, covariance[3:, 3:]))
+        found[k] = max(np.sqrt(error @ np.linalg.solve(c, error)) for error, c in parts)
+    return found
 
 
 def _relative(rotations: Array, centers: Array) -> tuple[Array, Array]:
