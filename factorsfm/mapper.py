@@ -35,6 +35,7 @@ _LIFT_PATIENCE = 10  # images without a usable depth map after which the start d
 _DEPTH_PATIENCE = 3  # keyframes without a depth map after which one does without
 _YOUNG_ERROR = 0.8  # relative, of a map that only the prior has shaped; falls with the square of the keyframes
 _LEAST_RELOCALIZED = 0.3  # of the similar corners must agree with the pose
+_RUNNING_OUT = 0.5  # share of an image's tracks with a point, below which the map is extended at once
 _LEAST_SHARED = 0.7  # of the tracks of the last keyframe; with fewer, a new one is made
 
 
@@ -130,9 +131,14 @@ class Mapper:
         elif not self.started:
             self._try_start(image, read_depth)
         else:
+            hurry = self.points.contains(image.tracks.ids).mean() < _RUNNING_OUT
+            if hurry:  # the camera is faster than the graph
+                self._take_over()
             self._register(image)
             if image.registered and self._update is None and self._is_keyframe(image):
                 self._add_keyframe(image, read_depth)
+                if hurry:
+                    self._take_over()
 
     def finish(self) -> None:
         """No more images: start with what there is, if nothing better came; all images on the map as it is at last."""

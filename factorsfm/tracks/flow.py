@@ -23,10 +23,8 @@ from factorsfm.tracks.patches import Array, BirthPatches, Image, in_parts
 _STATE = ("_texture", "_frame", "_next_id", "_ids", "_xy", "_born_at", "_velocity", "_ended")
 _MOST_ENDED = 3000  # tracks that are remembered
 _REVIVAL_REACH = 2.0  # times that of a re-alignment: where a track should be is known less well
-_SCOUTS = 64
-import os
-
-_FC, _FR = float(os.environ.get("FC", ".3")), float(os.environ.get("FR", "3"))
+_SCOUTS = 64  # tracks that tell how the camera's motion has changed
+_SURPRISE_PX, _SURPRISE_RATIO = 0.5, 3.0  # distance from the predicted place; and times that of the others
 _GRID = 24  # cells along the longer image side in which the local motion is estimated
 _BLANK_SHARE = 0.2  # of the texture of the last frame; with less, a frame among others is black or a flash
 
@@ -113,8 +111,7 @@ class FlowTracker:
             image: (h, w) grey, the last one tracked.
             ids: (n,) of ended tracks; xy: (n, 2) where they should be (pixels).
         """
-        inside = np.isfinite(xy).all(axis=1)
-        inside[inside] = _inside(xy[inside], image.shape, self.options.border_px)
+        inside = np.isfinite(xy).all(axis=1) & _inside(np.nan_to_num(xy), image.shape, self.options.border_px)
         if not inside.any():
             return np.zeros(0, np.int64)
         order = np.argsort(self._ended)
@@ -193,7 +190,7 @@ class FlowTracker:
             )
             surprise = np.linalg.norm(new[settled] - start, axis=1)
             if ok.any():
-                ok[settled] &= surprise < max(0.5, _FR * np.median(surprise[ok[settled]]))
+                ok[settled] &= surprise < max(_SURPRISE_PX, _SURPRISE_RATIO * np.median(surprise[ok[settled]]))
         search = np.nonzero(~ok)[0]
         new[search], ok[search] = self._search(previous, frame, old[search])
         linear = np.empty((n, 2, 2), np.float32)
@@ -222,7 +219,7 @@ class FlowTracker:
         change, _ = cv2.estimateAffinePartial2D(predicted[scouts[seen]], found[seen], ransacReprojThreshold=1.0)
         if change is None:
             return predicted
-        return (predicted @ change[:, :2].T + change[:, 2]).astype(np.float32)
+        return np.asarray((predicted @ change[:, :2].T + change[:, 2]).astype(np.float32), np.float32)
 
     def _roughly(self, previous: _Frame, frame: _Frame, xy: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Flow of points in the images of half the size, whatever the motion; and where there is any."""
@@ -286,7 +283,7 @@ _COARSE = (_STOP, 12, 0.02)  # from frame to frame: the re-alignment does the re
 
 def _halved(grey: Image) -> Image:
     h, w = grey.shape
-    return cv2.resize(grey[: h // 2 * 2, : w // 2 * 2], (w // 2, h // 2), interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.resize(grey[: h // 2 * 2, : w // 2 * 2], (w // 2, h // 2), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def _texture(half: Image) -> float:
@@ -295,7 +292,7 @@ def _texture(half: Image) -> float:
     return float(cv2.Laplacian(cv2.GaussianBlur(half.astype(np.float32), (0, 0), 0.7), cv2.CV_32F).std()) / 4
 
 
-def _inside(xy: Array, shape: tuple[int, ...], border: int) -> NDArray[np.bool_]:
+def _inside(xy: NDArray[np.floating[Any]], shape: tuple[int, ...], border: int) -> NDArray[np.bool_]:
     h, w = shape[:2]
     return (xy > border - 1).all(axis=1) & (xy[:, 0] < w - border) & (xy[:, 1] < h - border)
 

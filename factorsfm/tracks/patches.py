@@ -135,7 +135,7 @@ def _cut(grey: Image, xy: Array) -> Image:
     side = 2 * _SUPPORT + 1
     padded = cv2.copyMakeBorder(grey, _SUPPORT, _SUPPORT, _SUPPORT, _SUPPORT, cv2.BORDER_REFLECT_101)
     x, y = np.rint(xy).astype(int).T
-    return np.lib.stride_tricks.sliding_window_view(padded, (side, side))[y, x]
+    return np.asarray(np.lib.stride_tricks.sliding_window_view(padded, (side, side))[y, x], np.uint8)
 
 
 def _warped(patches: Image, affine: Array, half: int) -> Image:
