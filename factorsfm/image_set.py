@@ -307,7 +307,8 @@ class ImageSet:
         for photo, frame in zip(self.photos, result.frames, strict=True):
             if photo.twin is not None and not photo.left_out:
                 twin = result.frames[photo.twin]
-                frame.status, frame.cam_from_world, frame.covariance = twin.status, twin.cam_from_world, twin.covariance
+                frame.status, frame.cam_from_world = twin.status, twin.cam_from_world
+                frame.covariance, frame.observability = twin.covariance, twin.observability
                 frame.message = f"the same image as {twin.name}, whose pose it has"
             elif photo.remark and frame.registered:
                 frame.message += f"; {photo.remark}"
@@ -322,6 +323,9 @@ class ImageSet:
             result.observation_error = result.observation_error * factor
             for frame in result.frames:
                 frame.reprojection_error *= factor
+                if frame.observability is not None:
+                    slide = frame.observability.pixel_slide * factor
+                    frame.observability = replace(frame.observability, pixel_slide=slide)
 
     def _summary(self, result: Reconstruction) -> list[str]:
         notes = [f"{photo.name}: {photo.left_out}." for photo in self.photos if photo.left_out]

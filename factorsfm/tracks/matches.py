@@ -36,7 +36,7 @@ class PairMatches:
     """Verified matches of two images.
 
     Attributes:
-        first, second: positions of the images.
+        first, second: positions of the images, the smaller one first.
         rows: (m, 2) keypoints of the first and of the second.
     """
 
@@ -51,12 +51,10 @@ class SetMatches:
 
     Attributes:
         keypoints: per image (n, 2) pixels, centres at integers.
-        size: per image (n,) scale of the keypoints (pixels).
         pairs: verified matches.
     """
 
     keypoints: list[Array]
-    size: list[Array]
     pairs: list[PairMatches]
 
 
@@ -78,7 +76,7 @@ def match_images(
     with _quiet_colmap():
         _extract(database, images, names, cameras, masks)
         if len(names) <= EXHAUSTIVE_UP_TO:
-            pycolmap.match_exhaustive(database)
+            pycolmap.match_exhaustive(database, verification_options=_verification())
         else:
             _match_alike(database, len(names))
     return read_matches(database, names)
@@ -86,14 +84,13 @@ def match_images(
 
 def read_matches(database: Path, names: Sequence[str]) -> SetMatches:
     """The content of a database; images that are not in it have no keypoints."""
-    keypoints, size = [], []
+    keypoints = []
     with pycolmap.Database.open(database) as db:
         position = {}
         for i, name in enumerate(names):
             image = db.read_image_with_name(name)
-            found = np.zeros((0, 6)) if image is None else np.asarray(db.read_keypoints(image.image_id), np.float64)
+            found = np.zeros((0, 2)) if image is None else np.asarray(db.read_keypoints(image.image_id), np.float64)
             keypoints.append(found[:, :2] - PIXEL_CENTER)
-            size.append(_keypoint_size(found))
             if image is not None:
                 position[image.image_id] = i
         pairs = []
@@ -101,8 +98,11 @@ def read_matches(database: Path, names: Sequence[str]) -> SetMatches:
             a, b = pycolmap.pair_id_to_image_pair(pair_id)
             rows = np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)
             if len(rows) and a in position and b in position:
-                pairs.append(PairMatches(position[a], position[b], rows))
-    return SetMatches(keypoints, size, pairs)
+                first, second = position[a], position[b]
+                if first > second:  # the database numbers images as their features got ready
+                    first, second, rows = second, first, rows[:, ::-1]
+                pairs.append(PairMatches(first, second, rows))
+    return SetMatches(keypoints, sorted(pairs, key=lambda pair: (pair.first, pair.second)))
 
 
 def join_tracks(keypoints: Sequence[Array], pairs: Sequence[PairMatches]) -> list[tuple[Index, Index]]:
@@ -169,6 +169,12 @@ def _extract(
                 db.update_camera(known)
 
 
+def _verification() -> pycolmap.TwoViewGeometryOptions:
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = _SEED
+    return options
+
+
 @contextmanager
 def _quiet_colmap() -> Iterator[None]:
     """Keep COLMAP from writing its progress to stderr, past all Python logging."""
@@ -188,11 +194,11 @@ def _match_alike(database: Path, count: int) -> None:
     alike = pycolmap.VocabTreePairingOptions()
     alike.vocab_tree_path = vocabulary
     alike.num_images = min(_NEIGHBOURS_ALIKE, count - 1)
-    pycolmap.match_vocabtree(database, pairing_options=alike)
+    pycolmap.match_vocabtree(database, pairing_options=alike, verification_options=_verification())
     neighbours = pycolmap.SequentialPairingOptions()
     neighbours.overlap = _NEIGHBOURS_BY_NAME
     neighbours.quadratic_overlap = False
-    pycolmap.match_sequential(database, pairing_options=neighbours)
+    pycolmap.match_sequential(database, pairing_options=neighbours, verification_options=_verification())
 
 
 def _build_vocabulary(database: Path, path: Path) -> None:
@@ -212,11 +218,6 @@ def _build_vocabulary(database: Path, path: Path) -> None:
     options.num_visual_words = _WORDS
     index.build(options, descriptors)
     index.write(path)
-
-
-def _keypoint_size(found: Array) -> Array:
-    """(n,) scale of keypoints with affine shape (x, y, a11, a12, a21, a22)."""
-    return np.sqrt(np.abs(found[:, 2] * found[:, 5] - found[:, 3] * found[:, 4]))
 
 
 # --- tracks -----------------------------------------------------------------------------------------------------
