@@ -8,12 +8,15 @@ from factorsfm.api import reconstruct
 from factorsfm.camera import guess_camera, read_camera
 from factorsfm.episode import Episode, ShotResult
 from factorsfm.errors import FactorsfmError, InputError, ModelError, ReconstructionError
+from factorsfm.explicit_graph import factor_graph
+from factorsfm.export.options import ExportOptions, UpAxis
+from factorsfm.export.reading import read_result
 from factorsfm.frames import Frame, read_frames
 from factorsfm.live import Live, track
 from factorsfm.options import PRESETS, MapperOptions, Options, PolishOptions, TrackerOptions
 from factorsfm.priors.depth import DepthFolder, DepthKind, DepthMap, DepthModel, DepthPrior
 from factorsfm.priors.masks import MaskFolder, MaskModel, MaskPrior
-from factorsfm.reconstruction import FrameResult, FrameStatus, PriorFit, Reconstruction, ShotKind
+from factorsfm.reconstruction import CameraObservability, FrameResult, FrameStatus, PriorFit, Reconstruction, ShotKind
 from factorsfm.shots import CutDetector, ShotUpdate, find_shots
 from factorsfm.sources import RawFormat, Source, open_source
 from factorsfm.stream import FrameUpdate, Stream
@@ -22,6 +25,7 @@ logging.getLogger(__name__).addHandler(logging.NullHandler())
 
 __all__ = [
     "PRESETS",
+    "CameraObservability",
     "CutDetector",
     "DepthFolder",
     "DepthKind",
@@ -29,6 +33,7 @@ __all__ = [
     "DepthModel",
     "DepthPrior",
     "Episode",
+    "ExportOptions",
     "FactorsfmError",
     "Frame",
     "FrameResult",
@@ -53,11 +58,14 @@ __all__ = [
     "Source",
     "Stream",
     "TrackerOptions",
+    "UpAxis",
+    "factor_graph",
     "find_shots",
     "guess_camera",
     "open_source",
     "read_camera",
     "read_frames",
+    "read_result",
     "reconstruct",
     "track",
 ]
