@@ -44,7 +44,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             elif arguments.command == "export":
                 print(export_command.run(arguments))
             elif arguments.command == "stream":
-                print(stream_command.run(arguments, progress, progress.show))
+                said = stream_command.run(arguments, progress, progress.show)
+                progress.clear()
+                print(said)
             elif arguments.command == "overlay":
                 sentence = overlay_command.run(arguments, progress)
                 progress.clear()
