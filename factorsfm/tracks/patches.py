@@ -16,9 +16,9 @@ Rows = NDArray[np.intp]
 
 _SUPPORT = 22  # half side of a stored patch: the window at half the birth's scale, with its margin
 _MARGIN = 2  # of a warped patch around the window: interpolation and derivative
-_STALE_PX = 0.1  # change of the map at the edge of the window with which a patch is warped again
+_STALE_PX = 0.05  # change of the map at the edge of the window with which a patch is warped again
 _STOP = cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS
-_FINE = (_STOP, 15, 0.005)
+_FINE = (_STOP, 20, 0.003)
 _BACK = (_STOP, 5, 0.03)  # the way back only has to tell whether it ends where it began
 
 
