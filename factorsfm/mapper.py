@@ -31,6 +31,7 @@ _PAIR_WINDOW = 10  # images among which the paper's initial pair is sought
 _STATE = (
     "focal", "keyframes", "new_points", "parallax", "started", "_start_kind", "_waits_for_depth", "_due",
 )  # fmt: skip
+_START_SAMPLE = 40  # images among which the one that shares most is sought
 _LIFT_PATIENCE = 10  # images without a usable depth map after which the start does without
 _DEPTH_PATIENCE = 3  # keyframes without a depth map after which one does without
 _YOUNG_ERROR = 0.8  # relative, of a map that only the prior has shaped; falls with the square of the keyframes
@@ -192,18 +193,21 @@ class Mapper:
         return start_pair(images, o.min_tracks, focal=self.focal, sigma=o.pixel_sigma, inlier_px=o.inlier_px)
 
     def _start_essential(self, angle_deg: float) -> Start | NoStart:
-        """The first waiting image and the last one; with no angle asked for, the partner with most parallax.
+        """The last waiting image and the first one that still shares its tracks, as not after a fade.
 
-        First is the first one that has not lost its tracks since, as in a fade.
+        With no angle asked for: the one that shares tracks with most others, and the partner with most parallax.
         """
         o = self.options
         waiting = [image.tracks for image in self._waiting()]
         if len(waiting) < 2:
             return NoStart(f"{len(waiting)} of 2 needed images")
-        sharing = bisect_left(waiting[:-1], o.min_tracks, key=lambda t: _shared(t, waiting[-1]))  # ever more do
-        first = waiting[sharing] if sharing < len(waiting) - 1 else waiting[0]
-        partners = waiting[-1:]
-        if angle_deg <= 0.0:
+        if angle_deg > 0.0:
+            sharing = bisect_left(waiting[:-1], o.min_tracks, key=lambda t: _shared(t, waiting[-1]))  # ever more do
+            first = waiting[sharing if sharing <= len(waiting) // 2 else 0]  # not because of what came at last
+            partners = waiting[-1:]
+        else:
+            sample = waiting[:: len(waiting) // _START_SAMPLE + 1]
+            first = max(sample, key=lambda t: sum(_shared(t, other) >= o.min_tracks for other in sample))
             partners = [t for t in waiting if t is not first and _shared(first, t) >= o.min_tracks]
             partners = sorted(partners, key=lambda t: -median_flow(first, t))[:5]
         start: Start | NoStart = NoStart("no partner")

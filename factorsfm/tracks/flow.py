@@ -321,6 +321,8 @@ def _spread(corners: Array, count: int, shape: tuple[int, ...]) -> Array:
 
 def _local_affine(old: Array, new: Array, shape: tuple[int, ...]) -> NDArray[np.float32]:
     """(n, 2, 2) linear part of the local motion old -> new: weighted regression on a grid of moments."""
+    if not len(old):
+        return np.zeros((0, 2, 2), np.float32)
     h, w = shape[:2]
     cell = max(h, w) / _GRID
     gw, gh = int(np.ceil(w / cell)), int(np.ceil(h / cell))
