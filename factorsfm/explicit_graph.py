@@ -19,6 +19,7 @@ from factorsfm.reconstruction import Reconstruction, ShotKind
 from factorsfm.registration import SCALE_SIGMA, SHIFT_SIGMA
 
 _HELD, _FREE = 1e-6, 1e3  # standard deviations of what is constant, and of what is not
+_WEAK = 100.0  # standard deviation of a point's prior, in units of its distance
 _SMALLEST_SIGMA_PX = 0.03
 _RAYLEIGH_MEDIAN = 1.1774  # median of the norm of a 2-D error, in standard deviations
 
@@ -45,7 +46,7 @@ def factor_graph(reconstruction: Reconstruction) -> tuple[gtsam.NonlinearFactorG
         graph.add(gtsam.PriorFactorPose3(X(i), values.atPose3(X(i)), noise.Diagonal.Sigmas(sigmas)))
     for j, point in enumerate(r.points):
         values.insert(L(j), point)
-        graph.add(gtsam.PriorFactorPoint3(L(j), point, noise.Isotropic.Sigma(3, float(np.linalg.norm(point)))))
+        graph.add(gtsam.PriorFactorPoint3(L(j), point, noise.Isotropic.Sigma(3, _WEAK * float(np.linalg.norm(point)))))
 
     rows = np.flatnonzero(np.isin(r.observation_frame, list(poses)))
     frame_of, point_of = r.observation_frame[rows], r.observation_point[rows]

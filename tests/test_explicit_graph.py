@@ -34,9 +34,15 @@ def factors_of(graph: gtsam.NonlinearFactorGraph, kind: type) -> list[gtsam.Nois
     return [graph.at(k) for k in range(graph.size()) if isinstance(graph.at(k), kind)]
 
 
-def moved(a: gtsam.Values, b: gtsam.Values) -> np.ndarray:
-    """(frames, 6) of the poses."""
-    return np.array([a.atPose3(X(i)).localCoordinates(b.atPose3(X(i))) for i in range(FRAMES)])
+def moved(a: gtsam.Values, b: gtsam.Values, unit: float = 1.0) -> np.ndarray:
+    """(frames, 6) of the poses, those of `b` in another unit of length."""
+    poses = [b.atPose3(X(i)) for i in range(FRAMES)]
+    poses = [gtsam.Pose3(pose.rotation(), unit * pose.translation()) for pose in poses]
+    return np.array([a.atPose3(X(i)).localCoordinates(pose) for i, pose in enumerate(poses)])
+
+
+def mean_inverse_distance(values: gtsam.Values, count: int) -> float:
+    return float(np.mean([1.0 / np.linalg.norm(values.atPoint3(L(j))) for j in range(count)]))
 
 
 def test_it_holds_every_observation_and_every_variable() -> None:
@@ -75,14 +81,16 @@ def test_the_result_is_its_minimum(motion: Motion, guided: bool) -> None:
     found = optimized(graph, values)
     before, after = graph.error(values), graph.error(found)
     assert 0.99 * before < after <= before
+    unit = mean_inverse_distance(found, len(r.points)) / mean_inverse_distance(values, len(r.points))
+    assert unit == pytest.approx(1.0, abs=0.01)
     deviations = [np.sqrt(np.diag(frame.covariance)) for frame in r.frames]
-    for step, std in zip(moved(values, found)[1:], deviations[1:], strict=True):
+    for step, std in zip(moved(values, found, unit)[1:], deviations[1:], strict=True):
         assert (np.abs(step) < std).all()
     np.testing.assert_allclose(moved(values, found)[0], 0.0, atol=1e-5)
     for i, frame in enumerate(r.frames):
         if frame.prior is not None:
             scale, shift = affine_of_native(found.atCal3_S2(A(i)))
-            assert scale == pytest.approx(frame.prior.scale, abs=frame.prior.scale_std)
+            assert unit * scale == pytest.approx(frame.prior.scale, abs=frame.prior.scale_std)
             assert shift == pytest.approx(frame.prior.shift, abs=frame.prior.shift_std)
 
 
