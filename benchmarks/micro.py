@@ -6,7 +6,7 @@ import argparse
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -33,9 +33,13 @@ from factorsfm.factors import (
     pose_from_camera,
     virtual_offset,
 )
-from factorsfm.graph import DepthMeasurements, FactorGraph, Keyframe
-from factorsfm.options import PolishOptions
+from factorsfm.graph import FactorGraph
+from factorsfm.images import ImageTracks, MappedImage
+from factorsfm.map_update import MapCopy, update_map
+from factorsfm.options import MapperOptions, PolishOptions
+from factorsfm.point_map import PointMap
 from factorsfm.problem import Observations, State
+from factorsfm.reconstruction import FrameStatus
 from factorsfm.refinement import BundleAdjustment
 from factorsfm.registration import ImageDepth, register_image
 from factorsfm.synthetic import render_shot, synthetic_scene
@@ -131,47 +135,99 @@ def _add_whole_image(graph: gtsam.NonlinearFactorGraph, points: Array, factors: 
 
 
 def incremental_updates() -> str:
-    """Time of an update of the incremental graph by keyframes and landmarks."""
-    marks = (5, 10, 20, 40)
+    """Time of the map's update at a keyframe beside native factors in iSAM2, by keyframes and landmarks."""
+    marks, steps = (5, 10, 20, 30), MapperOptions().graph_iterations
     rows = []
-    for landmarks in (100, 250, 500):
-        times = _update_seconds(landmarks, max(marks))
-        rows.append([landmarks, *(f"{1e3 * times[mark - 1]:.0f}" for mark in marks)])
-    header = ["landmarks", *(f"keyframe {mark}" for mark in marks)]
+    for landmarks in (100, 300, 600):
+        shot = _keyframes(landmarks, max(marks))
+        for name, measure in {"`update_map`": _map_seconds, "native factors in iSAM2": _native_seconds}.items():
+            times = measure(*shot)
+            rows.append([len(shot[2]), name, *(f"{1e3 * times[mark - 1]:.0f}" for mark in marks)])
+    header = ["landmarks", "update", *(f"keyframe {mark}" for mark in marks)]
     return (
-        "Milliseconds per update (a copy, two iSAM2 updates, the checks), every landmark seen by every keyframe, depth "
-        f"prior on each.\n\n{table(header, rows)}"
+        "Milliseconds per update, every landmark seen by every keyframe, depth prior on each, a copy to roll back to "
+        "included. `update_map` condenses the landmarks in numpy, takes 40 steps over the number of keyframes, at "
+        f"least {steps}, and holds all but the newest 20 keyframes; the other has the landmarks as variables and takes "
+        f"{steps} steps over all keyframes.\n\n"
+        f"{table(header, rows)}"
     )
 
 
-def _update_seconds(landmarks: int, keyframes: int) -> list[float]:
-    scene = synthetic_scene("dolly", keyframes, 2 * landmarks, parallax=0.1)
+def _keyframes(landmarks: int, count: int) -> tuple[float, list[MappedImage], Array]:
+    """Focal length, keyframes at their true poses with noisy tracks and priors, and about `landmarks` true points."""
+    scene = synthetic_scene("dolly", count, 2 * landmarks, parallax=0.1)
     observed = scene.observe(_PIXEL_SIGMA)
-    everywhere = observed[0][0]
-    for ids, _ in observed[1:]:
-        everywhere = np.intersect1d(everywhere, ids)
-    everywhere = everywhere[:landmarks]
-    focal = float(scene.camera.focal_length_x)
-    graph = FactorGraph(focal, _PIXEL_SIGMA)
-    times = []
+    seen = np.bincount(np.concatenate([ids for ids, _ in observed]), minlength=len(scene.points))
+    everywhere = np.flatnonzero(seen == count)[:landmarks]
+    unit = float(np.median(1.0 / np.linalg.norm(scene.points[everywhere], axis=1)))
+    images = []
     for k, (ids, xy) in enumerate(observed):
-        rows = np.searchsorted(ids, everywhere)
         pose = scene.cam_from_world[k]
-        inverse = scene.inverse_depth(k, everywhere, noise=_DEPTH_NOISE)
-        keyframe = Keyframe(
+        inverse = scene.inverse_depth(k, everywhere, noise=_DEPTH_NOISE) / unit
+        tracks = ImageTracks(
             k,
-            pose.rotation.matrix(),
-            pose.translation,
-            everywhere,
-            normalized_from_pixels(scene.camera, xy[rows]),
-            DepthMeasurements(everywhere, inverse, np.full(len(inverse), _DEPTH_NOISE), (1.0, 0.0)),
+            np.arange(len(everywhere)),
+            normalized_from_pixels(scene.camera, xy[np.searchsorted(ids, everywhere)]),
+            ImageDepth(inverse, np.ones(len(everywhere)), 1.0),
         )
-        fresh = everywhere if k == 0 else everywhere[:0]
+        rotation, translation = pose.rotation.matrix(), unit * pose.translation
+        images.append(MappedImage(tracks, FrameStatus.REGISTERED, "", rotation, translation))
+    return float(scene.camera.focal_length_x), images, unit * scene.points[everywhere]
+
+
+def _map_seconds(focal: float, images: list[MappedImage], points: Array) -> list[float]:
+    graph, mapped, times = FactorGraph(), PointMap(), []
+    images = [replace(image) for image in images]
+    mapped.set(images[0].tracks.ids, points)
+    for k in range(len(images)):
         start = time.perf_counter()
-        result = graph.update(keyframe, fresh, scene.points[fresh], [])
+        copy = MapCopy([replace(image) for image in images[: k + 1]], mapped.copy(), MapperOptions(), focal)
+        update = update_map(copy, graph, None)
         times.append(time.perf_counter() - start)
-        if not result.committed:
-            raise RuntimeError(f"update {k} with {landmarks} landmarks: {result.reason}")
+        if not update.committed:
+            raise RuntimeError(f"update {k} with {len(points)} landmarks: {update.reason}")
+        mapped.set(update.ids, update.points)
+        for position, (rotation, translation) in update.poses.items():
+            images[position].rotation, images[position].translation = rotation, translation
+        for position, affine in update.affines.items():
+            images[position].affine = affine
+    return times
+
+
+def _native_seconds(focal: float, images: list[MappedImage], points: Array) -> list[float]:
+    parameters = gtsam.ISAM2Params()
+    parameters.setRelinearizeThreshold(0.01)
+    parameters.relinearizeSkip = 1
+    isam, times = gtsam.ISAM2(parameters), []
+    kernel, lens = gtsam.noiseModel.mEstimator.Cauchy.Create(_KERNEL), gtsam.Cal3_S2(focal, focal, 0.0, 0.0, 0.0)
+    pixel, depth = (
+        gtsam.noiseModel.Robust.Create(kernel, gtsam.noiseModel.Diagonal.Sigmas(np.array(sigmas)))
+        for sigmas in ([_PIXEL_SIGMA, _PIXEL_SIGMA], [_DEPTH_NOISE, 1e6])
+    )
+    affine = native_affine(1.0, 0.0)
+    for k, image in enumerate(images):
+        graph, values, tracks = gtsam.NonlinearFactorGraph(), gtsam.Values(), image.tracks
+        assert tracks.depth is not None
+        start = time.perf_counter()
+        values.insert(X(k), pose_from_camera(*image.pose))
+        values.insert(A(k), affine)
+        graph.add(gtsam.PriorFactorCal3_S2(A(k), affine, native_affine_noise(0.5, 0.3)))
+        if k == 0:
+            for key, pose in ((X(0), values.atPose3(X(0))), (T(0), virtual_offset())):
+                graph.add(gtsam.PriorFactorPose3(key, pose, gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)))
+            values.insert(T(0), virtual_offset())
+            for j, point in enumerate(points):
+                values.insert(L(j), point)
+                graph.add(gtsam.PriorFactorPoint3(L(j), point, gtsam.noiseModel.Isotropic.Sigma(3, 1.0)))
+        for j, (xy, inverse) in enumerate(zip(focal * tracks.xy, tracks.depth.inverse_depth, strict=True)):
+            graph.add(gtsam.GenericProjectionFactorCal3_S2(xy, pixel, X(k), L(j), lens))
+            graph.add(native_depth_factor(X(k), T(0), L(j), A(k), inverse, depth))
+        isam = gtsam.ISAM2(isam)
+        isam.update(graph, values)
+        for _ in range(MapperOptions().graph_iterations - 1):
+            isam.update()
+        isam.calculateEstimate()
+        times.append(time.perf_counter() - start)
     return times
 
 
@@ -376,7 +432,7 @@ def front_end(models: Path) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.micro", description=__doc__)
-    parser.add_argument("--models", type=Path, default=HERE.parents[1] / "shared" / "models", help="folder of networks")
+    parser.add_argument("--models", type=Path, default=Path("models"), help="folder of networks")
     parser.add_argument("--output", type=Path, default=HERE / "results", help="folder of MICRO.md")
     arguments = parser.parse_args()
     sections: dict[str, Callable[[], str]] = {
