@@ -76,16 +76,16 @@ class FactorGraph:
         """
         free = [(row, p) for row, (p, constant) in enumerate(zip(positions, held, strict=True)) if not constant]
         trial = _Trial(gtsam.ISAM2(self._isam), self._slots, free, guided)
-        before = adjustment.state
+        before, covariance = adjustment.state, {}
         try:
             adjustment.solve(iterations, trial.step)
-            trial.step(adjustment.state, *adjustment.condensed())  # the covariances are those without damping
-            covariance = {p: np.asarray(trial.isam.marginalCovariance(X(p))) for _, p in free}
+            reason = _fault(adjustment)
+            if not reason:
+                trial.step(adjustment.state, *adjustment.condensed())  # the covariances are those without damping
+                covariance = {p: np.asarray(trial.isam.marginalCovariance(X(p))) for _, p in free}
         except Exception as error:  # gtsam raises several types; any of them leaves the trial unusable
             message = (str(error).strip() or repr(error)).splitlines()[0]
             reason = f"the linear system of the update is indeterminate ({message})"
-        else:
-            reason = _fault(adjustment)
         if reason:
             logger.warning("update at frame %d rolled back: %s", positions[-1], reason)
             adjustment.state = before

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from bisect import bisect_left
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -279,9 +280,11 @@ class Mapper:
             depth_weight=o.depth_weight,
         )
         found = int(result.inliers.sum())
-        if found < o.min_inliers:
+        needed = math.ceil(o.min_inliers * result.threshold / o.inlier_px)  # more agree by chance within a wide one
+        if found < needed:
             image.status = FrameStatus.TOO_FEW_INLIERS
-            image.message = f"{found} of {o.min_inliers} needed inliers among {mapped.sum()} mapped tracks"
+            within = f"within {result.threshold:.1f} pixels among {mapped.sum()} mapped tracks"
+            image.message = f"{found} of {needed} needed inliers {within}"
             return
         inliers = np.zeros(len(tracks.ids), bool)
         inliers[np.nonzero(mapped)[0][result.inliers]] = True

@@ -42,13 +42,12 @@ from factorsfm.relocalization import Relocalizer
 from factorsfm.report.thumbnails import Thumbnails
 from factorsfm.result import assemble
 from factorsfm.snapshot import read_snapshot, write_snapshot
-from factorsfm.tracks.flow import FlowTracker
+from factorsfm.tracks.flow import BLANK_TEXTURE, FlowTracker
 
 logger = logging.getLogger(__name__)
 
 _STATE = ("_size", "_colors", "_pixels", "_focal_guessed", "_without_depth")
 _REVIVAL_INTERVAL = 5  # frames
-_BLANK_TEXTURE = 0.2  # grey levels; below this an image is black, white or out of focus
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,7 +171,7 @@ class Stream:
         focal_changed = self._advance(mapper)
         xy = normalized_from_pixels(self.camera, tracked.xy)
         usable = np.isfinite(xy).all(axis=1)  # a distortion model may have no inverse in the corners
-        usable &= tracked.texture >= _BLANK_TEXTURE  # what is tracked in a blank image is its noise
+        usable &= tracked.texture >= BLANK_TEXTURE  # what is tracked in a blank image is its noise
         pixels = tracked.xy[usable]
         tracks = ImageTracks(len(self.frames), tracked.ids[usable], xy[usable])
         with self._timed("mapping"):
@@ -446,9 +445,9 @@ def as_frame(frame: Frame | NDArray[np.uint8], index: int) -> Frame:
 
 def _mark_blank(image: MappedImage, texture: float) -> None:
     """Where an image without texture is not registered, that is the reason to give."""
-    if texture < _BLANK_TEXTURE and not image.registered:
+    if texture < BLANK_TEXTURE and not image.registered:
         image.status = FrameStatus.BLANK
-        image.message = f"contrast {texture:.2f} of {_BLANK_TEXTURE:.2f} needed grey levels"
+        image.message = f"contrast {texture:.2f} of {BLANK_TEXTURE:.2f} needed grey levels"
 
 
 def _pose(image: MappedImage) -> pycolmap.Rigid3d | None:

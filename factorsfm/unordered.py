@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from factorsfm.errors import InputError
 from factorsfm.frames import Frame, bgr_image, list_images, read_frames, read_image
+from factorsfm.tracks.flow import BLANK_TEXTURE, image_texture
 
 logger = logging.getLogger(__name__)
 
@@ -109,12 +110,14 @@ def _why_unordered(paths: list[Path]) -> str:
 
 def _trackable_share(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> float:
     """Share of the corners of the first image that are tracked to the second and back, and look the same there."""
+    if image_texture(cv2.cvtColor(first, cv2.COLOR_BGR2GRAY)) < BLANK_TEXTURE:
+        return 1.0  # a blank image says nothing
     size = (_SAMPLED_WIDTH, max(1, round(_SAMPLED_WIDTH * first.shape[0] / first.shape[1])))
     small = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (first, second))
     a, b = (cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) for image in small)
     corners = cv2.goodFeaturesToTrack(a, _SAMPLED_CORNERS, 0.01, 8)
     if corners is None:
-        return 1.0  # a blank image says nothing
+        return 1.0
     there, found, _ = cv2.calcOpticalFlowPyrLK(a, b, corners, None)
     back, found_back, _ = cv2.calcOpticalFlowPyrLK(b, a, there, None)
     error = np.linalg.norm((back - corners).reshape(-1, 2), axis=1)

@@ -101,7 +101,7 @@ def test_damaged_result_is_an_input_error(tmp_path: Path, damage: str) -> None:
     elif damage == "missing key":
         del summary["statuses"]
     else:
-        summary["statuses"][0]["status"] = "lost"
+        summary["statuses"][0]["status"] = "elsewhere"
     (out / "summary.json").write_text(json.dumps(summary))
     with pytest.raises(InputError, match="is damaged"):
         read_result(out)

@@ -170,7 +170,7 @@ def test_steps_are_newtons(guided):
     dense, _ = shot.adjustment(range(5))
     start = dense.state
     # iSAM2 linearises at its own estimate, and turns and moves at once: what is left is of second order.
-    for tolerance in (1e-4, 1e-5, 1e-6):
+    for tolerance in (1e-4, 1e-5, 3e-6):
         assert shot.solve(adjustment, range(5), rows, iterations=1).committed
         dense.solve(1)
         assert_same(adjustment.state, dense.state, tolerance)

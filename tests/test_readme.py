@@ -1,4 +1,4 @@
-"""Every example of the README runs, and what it says of commands, options and statuses is so."""
+"""Every example of the README runs, and what it says of commands, options, formats and statuses is so."""
 
 import hashlib
 import json
@@ -6,6 +6,7 @@ import os
 import re
 import shlex
 import shutil
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,15 +15,17 @@ import cv2
 import numpy as np
 import pytest
 from onnx import helper
-from test_export import build
 from test_models import save_network
 
-from factorsfm import PRESETS, DepthKind, FrameStatus, ShotKind, cli, read_camera
+from factorsfm import PRESETS, DepthKind, FrameStatus, ShotKind, cli, read_camera, reconstruct
+from factorsfm.export import FORMATS
 from factorsfm.priors import models
 from factorsfm.synthetic import render_shot, write_shot
 
 ROOT = Path(__file__).resolve().parents[1]
 TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
+COMMANDS = ("reconstruct", "stream", "export", "overlay", "demo")
 FRAMES = 10
 FILES = {"trajectory.tum", "colmap", "points.ply", "summary.json", "report.html"}
 
@@ -65,7 +68,9 @@ def material(tmp_path_factory: pytest.TempPathFactory) -> Path:
     nodes = [brightness, helper.make_node("Softplus", ["mean"], ["out"])]
     network = save_network(folder / "network.onnx", [1, 3, 48, 80], nodes)
     shutil.copy(network, folder / "networks" / models.MODELS["tcmonodepth"].file)
-    build().write(folder / "result")
+    (folder / "frames.bgr").write_bytes(np.stack(shot.images).tobytes())
+    camera, depth = read_camera(folder / "camera.json"), folder / "depth"
+    reconstruct(folder / "shot.mp4", camera=camera, depth=depth, depth_kind="inverse").write(folder / "result")
     return folder
 
 
@@ -87,11 +92,20 @@ def test_command(block: Block, place: Path, monkeypatch: pytest.MonkeyPatch) -> 
     for words in commands:
         while "=" in words[0]:
             monkeypatch.setenv(*words.pop(0).split("=", 1))
+        if "<" in words:
+            monkeypatch.setattr(sys, "stdin", (place / words.pop()).open())
+            words.pop()
         assert words[0] == "factorsfm"
         assert cli.main(words[1:]) == 0
-        assert {path.name for path in (place / "result").iterdir()} == FILES
-        summary = json.loads((place / "result" / "summary.json").read_text())
-        assert summary["registered"] == summary["frames"] == FRAMES
+        output = place / words[words.index("--output") + 1]
+        if words[1] in ("reconstruct", "stream"):
+            assert {path.name for path in output.iterdir()} == FILES
+            summary = json.loads((output / "summary.json").read_text())
+            assert summary["registered"] == summary["frames"] == FRAMES
+        elif output.is_dir():
+            assert any(output.iterdir())
+        else:
+            assert output.stat().st_size > 0
 
 
 @each("python")
@@ -132,21 +146,57 @@ def test_set_up_commands_are_those_of_ci() -> None:
     assert re.search(r"^factorsfm demo ", script, re.MULTILINE)
 
 
-def test_every_option_and_value_is_described(capsys: pytest.CaptureFixture[str]) -> None:
+def options_of(command: str, capsys: pytest.CaptureFixture[str]) -> set[str]:
     with pytest.raises(SystemExit):
-        cli.main(["reconstruct", "--help"])
-    options = set(re.findall(r"--[a-z-]+", capsys.readouterr().out)) - {"--help", "--verbose"}
-    assert len(options) == 7
+        cli.main([command, "--help"])
+    return set(re.findall(r"(?<![\w-])--[a-z][a-z-]+", capsys.readouterr().out)) - {"--help", "--verbose"}
+
+
+def test_every_option_and_value_is_described(capsys: pytest.CaptureFixture[str]) -> None:
+    options = set().union(*(options_of(command, capsys) for command in COMMANDS))
+    assert len(options) > 20
     assert set(re.findall(r"(?<![\w-])--[a-z][a-z-]+", TEXT)) == options
-    for value in (*PRESETS, *DepthKind, *ShotKind, *FrameStatus, *models.MODELS):
+    for value in (*PRESETS, *DepthKind, *ShotKind, *FrameStatus, *models.MODELS, *COMMANDS):
         assert f"`{value}`" in TEXT
     for status in (0, cli.BAD_INPUT, cli.NOT_RECONSTRUCTED, cli.INTERRUPTED):
         assert f"\n| {status} | " in TEXT
 
 
-def test_links_lead_somewhere() -> None:
-    targets = re.findall(r"\]\(([^)]+)\)", TEXT)
-    assert targets
-    headings = {re.sub(r"\W+", "-", h.lower()).strip("-") for h in re.findall(r"^#+ (.+)$", TEXT, re.MULTILINE)}
+@pytest.mark.parametrize(("heading", "commands"), [("Streaming", ["reconstruct", "stream"]), ("Export", ["export"])])
+def test_a_section_names_the_options_of_its_command(
+    heading: str, commands: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    section = TEXT.split(f"\n## {heading}\n")[1].split("\n## ")[0]
+    known = set().union(*(options_of(command, capsys) for command in commands))
+    named = set(re.findall(r"(?<![\w-])--[a-z][a-z-]+", section))
+    assert named <= known
+    assert options_of(commands[-1], capsys) - options_of(commands[0], capsys) <= named
+
+
+def test_the_formats_are_those_of_the_export() -> None:
+    rows = re.findall(r"^\| `([\w-]+)` \| a (file|folder): (.+) \| (\S+) \| (\S+) \| (\S+) \|$", TEXT, re.MULTILINE)
+    assert [name for name, *_ in rows] == list(FORMATS)
+    for name, kind, said, up, scale, first in rows:
+        chosen, defaults = FORMATS[name], FORMATS[name].defaults
+        assert (kind == "folder") == chosen.is_folder
+        assert up in (defaults.up_axis.value, "–")
+        assert scale in (f"{defaults.scale:g}", "–")
+        assert first in (str(defaults.first_frame), "–")
+        assert ("`vfx`" in said) == (name in ("usd", "stmap"))
+        assert ("`alembic`" in said) == (name == "alembic")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_somewhere(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    targets = re.findall(r"\]\(([^)]+)\)", text)
+    assert targets or page.name == "CHANGELOG.md"
     for target in targets:
-        assert target.removeprefix("#") in headings if target.startswith("#") else (ROOT / target).exists()
+        if target.startswith("https://"):
+            continue
+        name, _, anchor = target.partition("#")
+        other = (page.parent / name).resolve() if name else page
+        assert other.exists(), target
+        if anchor:
+            headings = re.findall(r"^#+ (.+)$", other.read_text(encoding="utf-8"), re.MULTILINE)
+            assert anchor in {re.sub(r"\W+", "-", heading.lower()).strip("-") for heading in headings}

@@ -21,6 +21,7 @@ from factorsfm.options import TrackerOptions
 from factorsfm.tracks.patches import Array, BirthPatches, Image, in_parts
 
 _STATE = ("_texture", "_frame", "_next_id", "_ids", "_xy", "_born_at", "_velocity", "_ended")
+BLANK_TEXTURE = 0.2  # grey levels
 _MOST_ENDED = 3000  # tracks that are remembered
 _REVIVAL_REACH = 2.0  # times that of a re-alignment: where a track should be is known less well
 _SCOUTS = 64  # tracks that tell how the camera's motion has changed
@@ -283,7 +284,14 @@ _COARSE = (_STOP, 12, 0.02)  # from frame to frame: the re-alignment does the re
 
 def _halved(grey: Image) -> Image:
     h, w = grey.shape
-    return np.asarray(cv2.resize(grey[: h // 2 * 2, : w // 2 * 2], (w // 2, h // 2), interpolation=cv2.INTER_AREA), np.uint8)
+    return np.asarray(
+        cv2.resize(grey[: h // 2 * 2, : w // 2 * 2], (w // 2, h // 2), interpolation=cv2.INTER_AREA), np.uint8
+    )
+
+
+def image_texture(grey: Image) -> float:
+    """Texture of a (h, w) image as in `TrackedFrame`; below `BLANK_TEXTURE` it is black, white or out of focus."""
+    return _texture(_halved(grey))
 
 
 def _texture(half: Image) -> float:
