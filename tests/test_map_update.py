@@ -379,7 +379,7 @@ def test_an_update_that_is_rolled_back_changes_nothing():
         copy_of(problem, images, map_of(points)), graph, lambda: image_depth(problem, 5, images[5].tracks.ids)
     )
     assert not update.committed
-    assert "behind the camera" in update.reason
+    assert "behind the camera" in update.reason or "indeterminate" in update.reason
     assert update.position == 5
     assert update.depth is not None  # it was read, and may serve
     assert (len(update.ids), len(update.removed), len(update.outliers)) == (0, 0, 0)
