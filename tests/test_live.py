@@ -162,6 +162,15 @@ def test_a_black_stretch_is_blank_and_nothing_else_changes():
     assert updates[-1].tracks > 0.8 * plain[-1].tracks
 
 
+def test_noise_has_no_pose():
+    shot = rendered("dolly")
+    noise = np.random.default_rng(0).integers(0, 256, (12, 180, 320, 3), np.uint8)
+    order = [0, 1, 2, 3, *[3] * len(noise), 4, 5, 6, 7]
+    updates, stream = streamed(shot, [*shot.images[:4], *noise, *shot.images[4:]], order)
+    assert [update.cam_from_world is not None for update in updates] == [True] * 4 + [False] * 12 + [True] * 4
+    assert sum(frame.registered for frame in stream.finish().frames) == FRAMES
+
+
 def test_black_frames_at_the_start_are_waited_out():
     shot = rendered("dolly")
     updates, _ = streamed(shot, [BLACK, BLACK, *shot.images], [0, 0, *range(FRAMES)])
