@@ -167,7 +167,8 @@ def pixel_slide(covariance: Array, depth: Array, focal: float) -> Array:
 
 
 def _median_by_frame(values: Array, observations: Observations) -> Array:
-    return np.array([np.median(values[observations.frame == k]) for k in range(observations.frame.max() + 1)])
+    by_frame = (values[observations.frame == k] for k in range(observations.frame.max() + 1))
+    return np.array([np.median(mine) if len(mine) else np.nan for mine in by_frame])
 
 
 # --- in words ---------------------------------------------------------------------------------------------------

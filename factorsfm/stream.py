@@ -165,7 +165,7 @@ class Stream:
         with self._timed("masks"):
             mask = read_mask(self._masks, frame)
         with self._timed("tracking"):
-            tracked = self._tracker.track(frame.image, mask)
+            tracked = self._tracker.track(frame.image, mask, self._expected(mapper))
         self._remember_colors(frame.image, tracked.ids, tracked.xy)
         grey = cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY)
         focal_changed = self._advance(mapper)
@@ -327,19 +327,28 @@ class Stream:
         self.close()
 
     def _keep_in_sight(self, image: MappedImage, grey: NDArray[np.uint8], pixels: NDArray[np.float64]) -> None:
-        """Find the view again where it was lost, and take up tracks again whose points are back in it."""
+        """Find the view again where it was lost, and take up the tracks whose points it shows."""
         mapper = self._mapper
         assert mapper is not None
         if image.keyframe:
             self._relocalizer.remember(grey, image.tracks.ids, pixels)
-        lost = mapper.started and not image.registered
-        if lost:
+        if mapper.started and not image.registered:
             ids, rows = self._relocalizer.find(grey, pixels)
-            if not mapper.relocalize(image, ids, image.tracks.xy[rows]):
-                return
-        if image.registered and (lost or image.tracks.position % _REVIVAL_INTERVAL == 0):
-            ids, xy = mapper.visible(image, self._tracker.ended)
-            self._tracker.revive(grey, ids, pixels_from_normalized(self.camera, xy))
+            if mapper.relocalize(image, ids, image.tracks.xy[rows]):
+                self._tracker.revive(grey, *self._in_view(mapper, image))
+
+    def _expected(self, mapper: Mapper) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
+        """Now and then, the ended tracks that the last image should show."""
+        last = mapper.images[-1] if mapper.images else None
+        if last is None or not last.registered or len(mapper.images) % _REVIVAL_INTERVAL:
+            return None
+        return self._in_view(mapper, last)
+
+    def _in_view(self, mapper: Mapper, image: MappedImage) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Ended tracks with a point in front of an image, and where it is seen (pixels)."""
+        assert self.camera is not None
+        ids, xy = mapper.visible(image, self._tracker.ended)
+        return ids, pixels_from_normalized(self.camera, xy)
 
     def _open(self, frame: Frame) -> Mapper:
         """Everything that waits for the size of the first frame."""

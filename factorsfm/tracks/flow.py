@@ -74,12 +74,18 @@ class FlowTracker:
         self._ended_patches = BirthPatches(options.window_px)
         self._pool = ThreadPoolExecutor(2)
 
-    def track(self, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None) -> TrackedFrame:
+    def track(
+        self,
+        image: NDArray[np.uint8],
+        mask: NDArray[np.bool_] | None = None,
+        expected: tuple[NDArray[np.int64], NDArray[np.float64]] | None = None,
+    ) -> TrackedFrame:
         """Follow all tracks into `image` and start new ones where the image is not covered.
 
         Args:
             image: (h, w, 3) BGR or (h, w) grey.
             mask: (h, w), True where nothing may be tracked.
+            expected: ended tracks that are in view again, see `revive`; they come before new ones.
         """
         grey = np.ascontiguousarray(image) if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         frame = _Frame(grey, _halved(grey))
@@ -90,6 +96,8 @@ class FlowTracker:
         if self._previous is not None and before:
             self._step(self._previous, frame, mask)
         lost = before - len(self._ids)
+        if expected is not None:
+            self.revive(grey, *expected)
         born = self._replenish(grey, mask)
         self._previous, self._texture = frame, texture
         self._frame += 1
