@@ -14,6 +14,7 @@ _DOUBTFUL_PX = 1.0  # median reprojection error; tracks are good to a tenth of a
 _NO_SHARE = 0.05  # of the depth prior, below which it is not worth a word
 _STATUS = {
     "registered": "solved",
+    "lost": "the view is not in the map",
     "static": "solved, camera at rest",
     "too_few_tracks": "too little to track",
     "too_few_inliers": "tracks contradict the scene",
