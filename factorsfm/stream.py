@@ -137,6 +137,7 @@ class Stream:
         self._tracker = FlowTracker(self.options.tracker)
         self._relocalizer = Relocalizer()
         self._thumbnails = Thumbnails()
+        self._blas_limit: threadpool_limits | None = None
         self._mapper: Mapper | None = None
         self._size = (0, 0)
         self._colors = np.zeros((0, 3), np.uint8)
@@ -285,8 +286,7 @@ class Stream:
                 f"{registered} of {len(mapper.images)} frames registered, at least 2 needed; "
                 f"frame {self.frames[worst.tracks.position].index}: {worst.message}"
             )
-        # The matrices are small: on busy cores BLAS threads would spend nearly all the time waiting for each other.
-        with self._timed("polish"), threadpool_limits(1, "blas"):
+        with self._timed("polish"):
             result = polish(
                 mapper.images,
                 mapper.points.all(),
@@ -311,12 +311,16 @@ class Stream:
             count, first = len(self._without_depth), self._without_depth[0]
             reconstruction.notes.append(f"Frames that went without depth because the prior failed: {count}; {first}.")
         self._thumbnails.attach(reconstruction.frames)
+        self.close()
         return reconstruction
 
     def close(self) -> None:
         """Give up without a result; `finish` closes, too."""
         if self._mapper is not None:
             self._mapper.close()
+        if self._blas_limit is not None:
+            self._blas_limit.restore_original_limits()
+            self._blas_limit = None
 
     def __enter__(self) -> Stream:
         return self
@@ -375,6 +379,8 @@ class Stream:
 
     def _new_mapper(self) -> Mapper:
         assert self.camera is not None
+        # The matrices are small: on busy cores BLAS threads would spend nearly all the time waiting for each other.
+        self._blas_limit = threadpool_limits(1, "blas")
         focal = 0.5 * (self.camera.focal_length_x + self.camera.focal_length_y)
         return Mapper(focal, self._size[0], self.options, has_prior=self._depth is not None)
 
