@@ -11,6 +11,7 @@ from factorsfm.errors import FactorsfmError, InputError, ModelError, Reconstruct
 from factorsfm.explicit_graph import factor_graph
 from factorsfm.export.options import ExportOptions, UpAxis
 from factorsfm.export.reading import read_result
+from factorsfm.frame_update import FrameUpdate
 from factorsfm.frames import Frame, read_frames
 from factorsfm.live import Live, track
 from factorsfm.options import PRESETS, MapperOptions, Options, PolishOptions, TrackerOptions
@@ -19,7 +20,7 @@ from factorsfm.priors.masks import MaskFolder, MaskModel, MaskPrior
 from factorsfm.reconstruction import CameraObservability, FrameResult, FrameStatus, PriorFit, Reconstruction, ShotKind
 from factorsfm.shots import CutDetector, ShotUpdate, find_shots
 from factorsfm.sources import RawFormat, Source, open_source
-from factorsfm.stream import FrameUpdate, Stream
+from factorsfm.stream import Stream
 
 logging.getLogger(__name__).addHandler(logging.NullHandler())
 

@@ -5,20 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from types import TracebackType
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from factorsfm.closing import Closing
 from factorsfm.errors import ReconstructionError
-from factorsfm.frames import Frame
+from factorsfm.frame_update import FrameUpdate
+from factorsfm.frames import Frame, as_frame
 from factorsfm.options import Options
 from factorsfm.priors.depth import DepthPrior
 from factorsfm.priors.masks import MaskPrior
 from factorsfm.reconstruction import FrameResult, Reconstruction
 from factorsfm.shots import CutDetector
-from factorsfm.stream import FrameUpdate, Stream, as_frame
+from factorsfm.stream import Stream
 
 _CERTAIN = 5  # frames of a shot after which the one before cannot come back
 
@@ -41,7 +42,7 @@ class ShotResult:
     frames: Sequence[FrameResult] = ()
 
 
-class Episode:
+class Episode(Closing):
     """Incremental reconstruction of a film, a `Stream` for every shot.
 
     Args:
@@ -111,14 +112,6 @@ class Episode:
         self._worker.shutdown(wait=False, cancel_futures=True)
         for stream in self._streams.values():
             stream.close()
-
-    def __enter__(self) -> Episode:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 def _finish(stream: Stream, progress: Callable[[str, int, int | None], None] | None) -> ShotResult:

@@ -14,14 +14,13 @@ from factorsfm.factors import (
     pose_from_camera,
     virtual_offset,
 )
+from factorsfm.noise import SMALLEST_SIGMA_PX, typical_sigma
 from factorsfm.options import PolishOptions
 from factorsfm.reconstruction import Reconstruction, ShotKind
 from factorsfm.registration import SCALE_SIGMA, SHIFT_SIGMA
 
 _HELD, _FREE = 1e-6, 1e3  # standard deviations of what is constant, and of what is not
 _WEAK = 100.0  # standard deviation of a point's prior, in units of its distance
-_SMALLEST_SIGMA_PX = 0.03
-_RAYLEIGH_MEDIAN = 1.1774  # median of the norm of a 2-D error, in standard deviations
 
 
 def factor_graph(reconstruction: Reconstruction) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
@@ -51,7 +50,7 @@ def factor_graph(reconstruction: Reconstruction) -> tuple[gtsam.NonlinearFactorG
     rows = np.flatnonzero(np.isin(r.observation_frame, list(poses)))
     frame_of, point_of = r.observation_frame[rows], r.observation_point[rows]
     focal = r.camera.mean_focal_length()
-    sigma = max(float(np.median(r.observation_error[rows])) / _RAYLEIGH_MEDIAN, _SMALLEST_SIGMA_PX)
+    sigma = max(typical_sigma(r.observation_error[rows]), SMALLEST_SIGMA_PX)
     lens, pixel = gtsam.Cal3_S2(focal, focal, 0, 0, 0), noise.Robust.Create(kernel, noise.Isotropic.Sigma(2, sigma))
     pixels = focal * normalized_from_pixels(r.camera, r.observation_xy[rows])
     for i, j, xy in zip(frame_of.tolist(), point_of.tolist(), pixels, strict=True):

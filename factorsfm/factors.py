@@ -33,10 +33,11 @@ def camera_points(rotation: Array, translation: Array, m: Array, w: Array) -> Ar
     return np.asarray(np.einsum("...ij,...j->...i", rotation, m) + w[..., None] * translation)
 
 
-def cross_matrix(v: Array) -> Array:
-    """(3, 3) matrix of ``v x .``."""
-    x, y, z = v
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+def cross_matrices(vectors: Array) -> Array:
+    """(n, 3, 3) matrices of the cross product by each vector."""
+    x, y, z = vectors.T
+    zero = np.zeros_like(x)
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
 
 
 def by_pose(by_q: Array, q: Array, w: Array) -> Array:

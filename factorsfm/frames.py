@@ -177,6 +177,17 @@ def bgr_image(image: object, index: int) -> NDArray[np.uint8]:
     return np.ascontiguousarray(depth8[:, :, :3])
 
 
+def as_frame(frame: Frame | NDArray[np.uint8], index: int) -> Frame:
+    """A frame with a BGR image; an image alone becomes the frame number `index`.
+
+    Raises:
+        InputError: it is no image.
+    """
+    if not isinstance(frame, Frame):
+        frame = Frame(index, frame, f"{index:06d}", None)
+    return replace(frame, image=bgr_image(frame.image, frame.index))
+
+
 def list_images(folder: Path) -> list[Path]:
     """Images of a folder in natural order, img2 before img10; none is no error."""
     images = [

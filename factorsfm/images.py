@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.problem import Observations
+from factorsfm.problem import Observations, State
 from factorsfm.reconstruction import FrameStatus
 from factorsfm.registration import ImageDepth
 
@@ -80,3 +80,26 @@ def median_flow(a: ImageTracks, b: ImageTracks) -> float:
     """Median displacement of the shared tracks, normalised image coordinates; infinite without any."""
     _, in_a, in_b = np.intersect1d(a.ids, b.ids, assume_unique=True, return_indices=True)
     return float(np.median(np.linalg.norm(a.xy[in_a] - b.xy[in_b], axis=1))) if len(in_a) else float("inf")
+
+
+def shared_tracks(a: ImageTracks, b: ImageTracks) -> int:
+    """How many tracks two images have in common."""
+    return int(np.isin(a.ids, b.ids, assume_unique=True).sum())
+
+
+def state_of(images: Sequence[MappedImage], points: Array, focal: float) -> State:
+    """Poses of registered images, and Euclidean points (n, 3), as variables of a bundle adjustment."""
+    distance = np.linalg.norm(points, axis=1)
+    return State(
+        np.array([image.rotation for image in images]),
+        np.array([image.translation for image in images]),
+        points / distance[:, None],
+        1.0 / distance,
+        float(np.log(focal)),
+    )
+
+
+def renormalize(images: Sequence[MappedImage], ratio: float) -> None:
+    """What was seen with another focal length; `ratio`: the former one over the new one."""
+    for image in images:
+        image.tracks = replace(image.tracks, xy=image.tracks.xy * ratio)

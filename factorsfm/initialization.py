@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.images import ImageTracks
+from factorsfm.images import ImageTracks, median_flow, shared_tracks
 from factorsfm.problem import Observations
 from factorsfm.registration import ImageDepth, register_image
 from factorsfm.triangulation import triangulate
@@ -19,6 +21,8 @@ Index = NDArray[np.int64]
 # A relative inverse depth of (almost) zero is a point at (almost) infinity; nothing is lifted farther than this.
 _FARTHEST = 20.0
 _FARTHEST_BASELINES = 1e5
+_SAMPLE = 40  # images among which the one that shares most is sought
+_PARTNERS = 5  # tried with it
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,3 +148,39 @@ def start_essential(
         [first.position, second.position], [np.eye(3), rotation], [np.zeros(3), translation.ravel() * unit],
         ids[keep][good], points.bearing[good] / points.inverse_distance[good, None] * unit,
     )  # fmt: skip
+
+
+def start_essential_among(
+    images: Sequence[ImageTracks], min_tracks: int, *, focal: float, sigma: float, angle_deg: float
+) -> Start | NoStart:
+    """`start_essential` of the last image and the first one that still shares its tracks, as not after a fade.
+
+    With no angle asked for: of the one that shares tracks with most others, and the partner with most parallax.
+    """
+    if len(images) < 2:
+        return NoStart(f"{len(images)} of 2 needed images")
+    if angle_deg > 0.0:
+        # The later an image, the more it shares with the last one.
+        sharing = bisect_left(images[:-1], min_tracks, key=lambda t: shared_tracks(t, images[-1]))
+        first = images[sharing if sharing <= len(images) // 2 else 0]  # not because of what came at last
+        partners = list(images[-1:])
+    else:
+        sample = images[:: len(images) // _SAMPLE + 1]
+        first = max(sample, key=lambda t: sum(shared_tracks(t, other) >= min_tracks for other in sample))
+        partners = [t for t in images if t is not first and shared_tracks(first, t) >= min_tracks]
+        partners = sorted(partners, key=lambda t: -median_flow(first, t))[:_PARTNERS]
+    start: Start | NoStart = NoStart("no partner")
+    for second in partners:
+        start = start_essential(first, second, min_tracks, focal=focal, sigma=sigma, angle_deg=angle_deg)
+        if isinstance(start, Start):
+            break
+    return start
+
+
+def start_flat(images: Sequence[ImageTracks]) -> Start | NoStart:
+    """All points at one depth: enough for the rotations of a shot that has no translation to offer."""
+    if not images:
+        return NoStart("no image with enough tracks")
+    first = images[0]
+    points = np.concatenate([first.xy, np.ones((len(first.xy), 1))], 1)
+    return Start([first.position], [np.eye(3)], [np.zeros(3)], first.ids, points)

@@ -4,23 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from types import TracebackType
 from typing import BinaryIO
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from factorsfm.closing import Closing
+from factorsfm.frame_update import FrameUpdate
 from factorsfm.frames import Frame
 from factorsfm.options import Options
 from factorsfm.priors.depth import DepthKind, DepthPrior, open_depth
 from factorsfm.priors.masks import MaskPrior, open_masks
 from factorsfm.reconstruction import Reconstruction
 from factorsfm.sources import RawFormat, Source, open_source
-from factorsfm.stream import FrameUpdate, Stream
+from factorsfm.stream import Stream
 
 
-class Live(Iterator[FrameUpdate]):
+class Live(Closing, Iterator[FrameUpdate]):
     """Updates of a source's frames; `finish` gives the reconstruction. Made by `track`.
 
     Attributes:
@@ -39,12 +40,8 @@ class Live(Iterator[FrameUpdate]):
         self.source.close()
         return self.stream.finish(progress)
 
-    def __enter__(self) -> Live:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
+        """Stop reading, and give up what is not finished."""
         self.source.close()
         self.stream.close()
 

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from factorsfm.graph import FactorGraph, UpdateResult
 from factorsfm.guidance import DepthGuidance
-from factorsfm.images import MappedImage, gather
+from factorsfm.images import MappedImage, gather, shared_tracks, state_of
+from factorsfm.noise import typical_sigma
 from factorsfm.options import MapperOptions, PolishOptions
 from factorsfm.point_map import PointMap
 from factorsfm.prior_term import joint_problem, usual_prior
@@ -32,7 +33,6 @@ _LEAST_SHARED = 30  # landmarks by which a constant keyframe takes part
 _GROSS = 4.0  # times the threshold of an inlier: a young map is wrong, too, and long tracks are precious
 _YOUNG_ITERATIONS = 40  # divided by the number of keyframes
 _SOLVER = replace(PolishOptions(), tolerance=1e-4)
-_RAYLEIGH_MEDIAN = 1.1774
 _LARGEST_SIGMA_PX = 3.0
 _ALIKE = 20.0  # tracks that count as one: the errors of neighbours are alike
 _LENS_KEYFRAMES = 6  # from which an unknown focal length is estimated
@@ -134,8 +134,7 @@ def _window(keyframes: list[MappedImage]) -> tuple[list[MappedImage], NDArray[np
     """The keyframes that take part, in order of time, and which of them are constant."""
     free = keyframes[-_FREE_KEYFRAMES:]
     before = keyframes[: -len(free)]
-    newest = keyframes[-1].tracks.ids
-    shared = np.array([np.isin(image.tracks.ids, newest, assume_unique=True).sum() for image in before], np.int64)
+    shared = np.array([shared_tracks(image.tracks, keyframes[-1].tracks) for image in before], np.int64)
     chosen = np.sort(np.argsort(-shared, kind="stable")[:_HELD_KEYFRAMES])
     window = [before[k] for k in chosen if shared[k] >= _LEAST_SHARED] + free
     held = np.arange(len(window)) < len(window) - len(free)
@@ -178,17 +177,9 @@ def _problem(
     copy: MapCopy, window: list[MappedImage], held: NDArray[np.bool_], ids: Index, observations: Observations
 ) -> tuple[BundleAdjustment, list[int]]:
     """The window's problem at the noise that its residuals show, and the rows of its frames with a prior."""
-    points = copy.points.at(ids)
-    distance = np.linalg.norm(points, axis=1)
-    state = State(
-        np.array([image.rotation for image in window]),
-        np.array([image.translation for image in window]),
-        points / distance[:, None],
-        1.0 / distance,
-        float(np.log(copy.focal)),
-    )
+    state = state_of(window, copy.points.at(ids), copy.focal)
     unit = BundleAdjustment(state, observations, _SOLVER, sigma=1.0, fixed=held)
-    typical = float(np.median(unit.reprojection_errors())) / _RAYLEIGH_MEDIAN
+    typical = typical_sigma(unit.reprojection_errors())
     sigma = min(max(copy.options.pixel_sigma, typical), _LARGEST_SIGMA_PX)
     weighed = usual_prior(state, observations, ids, window) if copy.options.graph_depth else None
     if weighed is None:

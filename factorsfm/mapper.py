@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-from bisect import bisect_left
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
@@ -13,10 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.factors import camera_points, cross_matrix
+from factorsfm.factors import camera_points, cross_matrices
 from factorsfm.graph import FactorGraph
-from factorsfm.images import ImageTracks, MappedImage, median_flow
-from factorsfm.initialization import NoStart, Start, start_essential, start_lifted, start_pair
+from factorsfm.images import ImageTracks, MappedImage, median_flow, renormalize, shared_tracks
+from factorsfm.initialization import NoStart, Start, start_essential_among, start_flat, start_lifted, start_pair
 from factorsfm.map_update import MapCopy, MapUpdate, update_map
 from factorsfm.options import Options
 from factorsfm.point_map import PointMap
@@ -32,7 +31,6 @@ _PAIR_WINDOW = 10  # images among which the paper's initial pair is sought
 _STATE = (
     "focal", "keyframes", "new_points", "parallax", "started", "_start_kind", "_waits_for_depth", "_due",
 )  # fmt: skip
-_START_SAMPLE = 40  # images among which the one that shares most is sought
 _LIFT_PATIENCE = 10  # images without a usable depth map after which the start does without
 _DEPTH_PATIENCE = 3  # keyframes without a depth map after which one does without
 _YOUNG_ERROR = 0.8  # relative, of a map that only the prior has shaped; falls with the square of the keyframes
@@ -149,7 +147,7 @@ class Mapper:
         if not self.started:
             self._begin(self._start_essential(angle_deg=0.0))
         if not self.started:
-            self._begin(self._start_flat())
+            self._begin(start_flat([image.tracks for image in self._waiting()]))
         self.refresh()
         self.close()
 
@@ -194,39 +192,9 @@ class Mapper:
         return start_pair(images, o.min_tracks, focal=self.focal, sigma=o.pixel_sigma, inlier_px=o.inlier_px)
 
     def _start_essential(self, angle_deg: float) -> Start | NoStart:
-        """The last waiting image and the first one that still shares its tracks, as not after a fade.
-
-        With no angle asked for: the one that shares tracks with most others, and the partner with most parallax.
-        """
         o = self.options
         waiting = [image.tracks for image in self._waiting()]
-        if len(waiting) < 2:
-            return NoStart(f"{len(waiting)} of 2 needed images")
-        if angle_deg > 0.0:
-            sharing = bisect_left(waiting[:-1], o.min_tracks, key=lambda t: _shared(t, waiting[-1]))  # ever more do
-            first = waiting[sharing if sharing <= len(waiting) // 2 else 0]  # not because of what came at last
-            partners = waiting[-1:]
-        else:
-            sample = waiting[:: len(waiting) // _START_SAMPLE + 1]
-            first = max(sample, key=lambda t: sum(_shared(t, other) >= o.min_tracks for other in sample))
-            partners = [t for t in waiting if t is not first and _shared(first, t) >= o.min_tracks]
-            partners = sorted(partners, key=lambda t: -median_flow(first, t))[:5]
-        start: Start | NoStart = NoStart("no partner")
-        for second in partners:
-            start = start_essential(
-                first, second, o.min_tracks, focal=self.focal, sigma=o.pixel_sigma, angle_deg=angle_deg
-            )
-            if isinstance(start, Start):
-                break
-        return start
-
-    def _start_flat(self) -> Start | NoStart:
-        """All points at one depth: enough for the rotations of a shot that has no translation to offer."""
-        if not self._waiting():
-            return NoStart("no image with enough tracks")
-        first = self._waiting()[0].tracks
-        points = np.concatenate([first.xy, np.ones((len(first.xy), 1))], 1)
-        return Start([first.position], [np.eye(3)], [np.zeros(3)], first.ids, points)
+        return start_essential_among(waiting, o.min_tracks, focal=self.focal, sigma=o.pixel_sigma, angle_deg=angle_deg)
 
     def _begin(self, start: Start | NoStart) -> None:
         if isinstance(start, NoStart):
@@ -357,7 +325,7 @@ class Mapper:
         shift = translation - turn @ keyframe.pose[1]
         adjoint = np.zeros((6, 6))
         adjoint[:3, :3] = adjoint[3:, 3:] = turn
-        adjoint[3:, :3] = cross_matrix(shift) @ turn
+        adjoint[3:, :3] = cross_matrices(shift[None])[0] @ turn
         return on_map + adjoint @ keyframe.covariance @ adjoint.T
 
     # --- keyframes and landmarks --------------------------------------------------------------------------------
@@ -365,7 +333,7 @@ class Mapper:
     def _is_keyframe(self, image: MappedImage) -> bool:
         o, count = self.options, len(self.keyframes)
         last = self.images[self.keyframes[-1]].tracks
-        shared = np.isin(image.tracks.ids, last.ids, assume_unique=True).sum()
+        shared = shared_tracks(image.tracks, last)
         # A young map has the shape that the prior guessed: the first keyframes come soon. Of a camera that hardly
         # moves, ever fewer are needed.
         youth = min(1.0, 0.25 * count)
@@ -421,9 +389,8 @@ class Mapper:
 
     def _set_focal(self, focal: float) -> None:
         """Normalise all that was seen with another focal length."""
-        ratio, self.focal = self.focal / focal, focal
-        for image in self.images:
-            image.tracks = replace(image.tracks, xy=ratio * image.tracks.xy)
+        renormalize(self.images, self.focal / focal)
+        self.focal = focal
 
     def _carry(self, position: int, before: tuple[Array, Array]) -> None:
         """Move the images after a keyframe with it: they were registered on the map as it was before."""
@@ -434,10 +401,6 @@ class Mapper:
                 relative = turn @ before[0].T
                 image.rotation = relative @ rotation
                 image.translation = relative @ (translation - before[1]) + shift
-
-
-def _shared(a: ImageTracks, b: ImageTracks) -> int:
-    return int(np.isin(a.ids, b.ids, assume_unique=True).sum())
 
 
 def _select(depth: ImageDepth, index: NDArray[np.bool_]) -> ImageDepth:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.factors import cross_matrices
 from factorsfm.problem import State
 
 Array = NDArray[np.float64]
@@ -111,10 +112,3 @@ def tangent_basis(bearing: Array) -> Array:
     first = np.cross(bearing, axis)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     return np.stack([first, np.cross(bearing, first)], -1)
-
-
-def cross_matrices(vectors: Array) -> Array:
-    """(n, 3, 3) matrices of the cross product by each vector."""
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)

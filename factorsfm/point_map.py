@@ -59,15 +59,6 @@ class PointMap:
         z = self._seen_from(image, image.tracks.ids[rows])[:, 2]
         return np.where(z > 1e-6, 1.0 / np.maximum(z, 1e-6), 0.0)
 
-    def reprojection_errors(self, image: MappedImage, rows: Mask) -> Array:
-        """Errors of mapped tracks in an image (normalised coordinates), infinite behind its camera."""
-        q = self._seen_from(image, image.tracks.ids[rows])
-        front = q[:, 2] > 1e-6
-        error = np.full(len(q), np.inf)
-        projected = q[front, :2] / q[front, 2:]
-        error[front] = np.linalg.norm(projected - image.tracks.xy[rows][front], axis=1)
-        return error
-
     def _seen_from(self, image: MappedImage, ids: Index) -> Array:
         points = self.at(ids)
         return camera_points(*image.pose, points, np.ones(len(points)))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from factorsfm.images import MappedImage, gather
 from factorsfm.marginals import in_scene_unit
+from factorsfm.noise import SMALLEST_SIGMA_PX, block_inflation, temporal_inflation, typical_sigma
 from factorsfm.observability import Motion, camera_observability, classify_motion, pose_blocks
 from factorsfm.options import FOCAL_STD, Options, PolishOptions
 from factorsfm.prior_term import PriorPart, joint_problem, weigh_prior
@@ -26,9 +27,6 @@ Index = NDArray[np.int64]
 logger = logging.getLogger(__name__)
 
 _FIRST_SIGMA_PX = 0.25
-_SMALLEST_SIGMA_PX = 0.03
-_RAYLEIGH_MEDIAN = 1.1774  # median of the norm of a 2-D error, in standard deviations
-_BLOCKS = (8, 5, 16)  # across, down, frames: in which errors may be alike
 _DOUBTFUL_INFLATION = 5.0  # sound solutions have 1 to 3.5
 _CORE_TRACKS = 400  # tracks with which the cameras converge first
 _TRIANGULATION_VIEWS = 10
@@ -90,7 +88,7 @@ def polish(
         ratio = focal / float(np.exp(adjustment.state.log_focal))
         few, observations = (replace(part, xy=part.xy * ratio) for part in (few, observations))
     motion = classify_motion(adjustment, few, o)
-    inflation = _block_inflation(adjustment, few)
+    inflation = block_inflation(adjustment.reprojection_vectors(), few)
     weighed = None
     if motion.kind is ShotKind.GENERAL:
         if o.depth:
@@ -220,7 +218,7 @@ def _core(observations: Observations, frames: int, count: int) -> Index:
 
 
 def _noise(errors: Array) -> float:
-    return max(float(np.median(errors)) / _RAYLEIGH_MEDIAN, _SMALLEST_SIGMA_PX)
+    return max(typical_sigma(errors), SMALLEST_SIGMA_PX)
 
 
 def _converge_cameras(
@@ -235,7 +233,10 @@ def _converge_cameras(
     few = _subset(observations, core)
     part = replace(state, bearing=state.bearing[core], inverse_distance=state.inverse_distance[core])
     best = _solve_core(part, few, options)
-    if best.sigma > options.polish.doubtful_px or _temporal_inflation(best, few) > _DOUBTFUL_INFLATION:
+    if (
+        best.sigma > options.polish.doubtful_px
+        or temporal_inflation(best.reprojection_vectors(), few) > _DOUBTFUL_INFLATION
+    ):
         logger.info("the solution does not fit (%.2f px), trying other starts", best.sigma)
         best = min(best, _solve_core(_flat(part, few, options.polish), few, options), key=lambda b: b.sigma)
         best = min(best, _solve_core(_reversed(best.state), few, options), key=lambda b: b.sigma)
@@ -315,45 +316,13 @@ def _checked_focal(
     """The estimated focal length where the shot determines it, else the guess."""
     covariance, _ = adjustment.covariance(np.zeros(0, np.int64))
     column = 6 * len(adjustment.state.rotation)
-    std = float(np.sqrt(covariance[column, column] * _temporal_inflation(adjustment, observations)))
+    inflation = temporal_inflation(adjustment.reprojection_vectors(), observations)
+    std = float(np.sqrt(covariance[column, column] * inflation))
     if std > FOCAL_STD or not 0.3 < float(np.exp(adjustment.state.log_focal)) / guess < 3.0:
         scaled = replace(adjustment.state, log_focal=float(np.log(guess)))
         adjustment = BundleAdjustment(scaled, observations, options, sigma=adjustment.sigma)
         adjustment.solve()
     return adjustment, std
-
-
-def _temporal_inflation(adjustment: BundleAdjustment, observations: Observations) -> float:
-    """By how much the errors of a track in neighbouring frames repeat each other, as a factor on the variance."""
-    residual = adjustment.reprojection_vectors()
-    next_one = (np.diff(observations.point) == 0) & (np.diff(observations.frame) == 1)
-    if next_one.sum() < 100:
-        return 1.0
-    size = np.linalg.norm(residual, axis=1)
-    inlier = size < 3.0 * np.median(size)
-    pair = np.nonzero(next_one & inlier[:-1] & inlier[1:])[0]
-    a, b = residual[pair], residual[pair + 1]
-    power = float(np.sqrt((a * a).sum() * (b * b).sum()))
-    correlation = float((a * b).sum()) / max(power, 1e-12)
-    correlation = min(max(correlation, 0.0), 0.9)
-    return (1.0 + correlation) / (1.0 - correlation)
-
-
-def _block_inflation(adjustment: BundleAdjustment, observations: Observations) -> float:
-    """By how much errors of neighbouring tracks in neighbouring frames repeat each other: a factor on the variance.
-
-    In a block of the image and of time, independent errors add up to the root of their number.
-    """
-    o, residual = observations, adjustment.reprojection_vectors()
-    size = np.linalg.norm(residual, axis=1)
-    inlier = size < 3.0 * np.median(size)
-    low, high = o.xy.min(0), o.xy.max(0)
-    cell = (0.999 * (o.xy - low) / np.maximum(high - low, 1e-9) * _BLOCKS[:2]).astype(np.int64)
-    key = ((o.frame // _BLOCKS[2]) * _BLOCKS[1] + cell[:, 1]) * _BLOCKS[0] + cell[:, 0]
-    key, residual = key[inlier], residual[inlier]
-    sums = [np.bincount(key, residual[:, axis]) for axis in range(2)]
-    power = float((residual**2).sum())
-    return max(1.0, float((sums[0] ** 2 + sums[1] ** 2).sum()) / max(power, 1e-12))
 
 
 # --- long shots -------------------------------------------------------------------------------------------------
@@ -390,7 +359,7 @@ def _add_frames_between(
         near = int(solved[np.argmin(np.abs(solved - f))])
         found = register_image(
             points[theirs], tracks.xy[mine] * (guess / focal), *poses[near],
-            focal=focal, sigma=max(result.sigma, _SMALLEST_SIGMA_PX), inlier_px=m.inlier_px,
+            focal=focal, sigma=max(result.sigma, SMALLEST_SIGMA_PX), inlier_px=m.inlier_px,
         )  # fmt: skip
         if found.inliers.sum() >= m.min_inliers:
             poses[f] = found.rotation, found.translation

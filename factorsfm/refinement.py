@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.factors import affine_inverse_depth, by_pose, cauchy, reprojection
-from factorsfm.marginals import Marginals, cross_matrices, tangent_basis
+from factorsfm.factors import affine_inverse_depth, by_pose, cauchy, cross_matrices, reprojection
+from factorsfm.marginals import Marginals, tangent_basis
 from factorsfm.options import PolishOptions
 from factorsfm.problem import Observations, PriorObservations, State
 

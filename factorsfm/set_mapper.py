@@ -13,11 +13,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.images import ImageTracks, MappedImage, gather
+from factorsfm.images import ImageTracks, MappedImage, gather, renormalize, state_of
 from factorsfm.initialization import NoStart, Start, start_essential, start_pair
 from factorsfm.options import Options
 from factorsfm.point_map import PointMap
-from factorsfm.problem import State
 from factorsfm.reconstruction import FrameStatus
 from factorsfm.refinement import BundleAdjustment
 from factorsfm.registration import register_image
@@ -272,14 +271,7 @@ class SetMapper:
         kept = np.isin(ids, seen[count >= 2], assume_unique=True)
         ids, points = ids[kept], points[kept]
         observations = gather(self._order, ids)
-        distance = np.linalg.norm(points, axis=1)
-        state = State(
-            np.array([i.rotation for i in self._order]),
-            np.array([i.translation for i in self._order]),
-            points / distance[:, None],
-            1.0 / distance,
-            float(np.log(self.focal)),
-        )
+        state = state_of(self._order, points, self.focal)
         errors = BundleAdjustment(state, observations, self._adjustment, sigma=1.0).reprojection_errors()
         sigma = max(float(np.median(errors)), _SIGMA_PX)
         free_focal = self._refine_focal and len(self._order) >= _FOCAL_IMAGES and self._angle > _FOCAL_ANGLE_DEG
@@ -301,8 +293,7 @@ class SetMapper:
         self._adjusted = len(self._order)
 
     def _set_focal(self, focal: float) -> None:
-        for image in self.images:
-            image.tracks = replace(image.tracks, xy=image.tracks.xy * (self.focal / focal))
+        renormalize(self.images, self.focal / focal)
         self.focal = focal
 
 

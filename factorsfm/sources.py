@@ -15,7 +15,6 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import TracebackType
 from typing import Any, BinaryIO, Literal, TypeGuard, cast
 from urllib.parse import urlsplit
 
@@ -23,6 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.closing import Closing
 from factorsfm.errors import FactorsfmError, InputError
 from factorsfm.frames import (
     Frame,
@@ -153,7 +153,7 @@ def open_source(
     return Source(chosen, name, closed, live if drop is None else drop, queue_size, stall_seconds)
 
 
-class Source(Iterator[Frame]):
+class Source(Closing, Iterator[Frame]):
     """Frames of a source, read by a thread of its own while they are consumed; made by `open_source`.
 
     Iterate over it, best in a ``with`` statement; leaving it, `close` or the end of the last reference stop the thread
@@ -214,14 +214,6 @@ class Source(Iterator[Frame]):
         self.ended = self.ended or f"{self.name} was closed after {self._count()}"
         self._stop()
         self._thread.join(_JOIN_SECONDS)  # unless it is stuck in foreign code, which nobody can interrupt
-
-    def __enter__(self) -> Source:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _end(self, error: Exception | None) -> None:
         self.ended = f"{self.name} ended after {self._count()}"

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import cv2
@@ -27,8 +26,10 @@ from factorsfm.camera import (
     pixels_from_normalized,
     with_focal,
 )
+from factorsfm.closing import Closing
 from factorsfm.errors import InputError, ModelError, ReconstructionError
-from factorsfm.frames import Frame, bgr_image
+from factorsfm.frame_update import FrameUpdate, KeyframePrior
+from factorsfm.frames import Frame, as_frame
 from factorsfm.images import ImageTracks, MappedImage
 from factorsfm.mapper import Mapper
 from factorsfm.options import Options
@@ -51,50 +52,6 @@ _REVIVAL_INTERVAL = 5  # frames
 
 
 @dataclass(frozen=True, slots=True)
-class KeyframePrior:
-    """Scale and shift of a keyframe's depth map beside the map, in the prior's unit: ``scale / z + shift``."""
-
-    index: int
-    scale: float
-    shift: float
-
-
-@dataclass(frozen=True, slots=True)
-class FrameUpdate:
-    """What is known of a frame right after it was pushed.
-
-    Attributes:
-        index: of the frame; status, message: see `FrameResult`.
-        cam_from_world: pose now, causal; None where the frame is not registered.
-        keyframe: whether the graph has been given it.
-        tracks, inliers: tracked points, and those that agree with the pose.
-        new_points: points that the map gained since the frame before.
-        parallax: largest camera displacement so far over the median depth of the points seen.
-        covariance: (6, 6) of the pose (see `FrameResult`), the uncertainty of the map included; None without a pose.
-        prior: the newest depth map that the graph has used, None as long as there is none.
-        dropped: frames that a live source dropped right before this one.
-        shot: number of the shot in an `Episode`.
-        focal_length: pixels, as the stream has it now; focal_changed: whether this frame changed it.
-    """
-
-    index: int
-    status: FrameStatus
-    message: str
-    cam_from_world: pycolmap.Rigid3d | None
-    keyframe: bool
-    tracks: int
-    inliers: int
-    new_points: int = 0
-    parallax: float = 0.0
-    covariance: NDArray[np.float64] | None = None
-    prior: KeyframePrior | None = None
-    dropped: int = 0
-    shot: int = 0
-    focal_length: float = float("nan")
-    focal_changed: bool = False
-
-
-@dataclass(frozen=True, slots=True)
 class SeenFrame:
     """What is kept of a frame: never its pixels."""
 
@@ -104,7 +61,7 @@ class SeenFrame:
     texture: float
 
 
-class Stream:
+class Stream(Closing):
     """Incremental reconstruction of one shot.
 
     Args:
@@ -166,9 +123,9 @@ class Stream:
         with self._timed("masks"):
             mask = read_mask(self._masks, frame)
         with self._timed("tracking"):
-            tracked = self._tracker.track(frame.image, mask, self._expected(mapper))
+            grey = np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY), np.uint8)
+            tracked = self._tracker.track(grey, mask, self._expected(mapper))
         self._remember_colors(frame.image, tracked.ids, tracked.xy)
-        grey = cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY)
         focal_changed = self._advance(mapper)
         xy = normalized_from_pixels(self.camera, tracked.xy)
         usable = np.isfinite(xy).all(axis=1)  # a distortion model may have no inverse in the corners
@@ -275,6 +232,10 @@ class Stream:
         mapper = self._mapper
         if mapper is None or len(self.frames) < 2:
             raise self._failure(f"frames in the shot: {len(self.frames)}, at least 2 needed")
+        with self:
+            return self._polished(mapper, progress)
+
+    def _polished(self, mapper: Mapper, progress: Callable[[str, int, int | None], None] | None) -> Reconstruction:
         with self._timed("mapping"):
             mapper.finish()
         for image, seen in zip(mapper.images, self.frames, strict=True):
@@ -311,7 +272,6 @@ class Stream:
             count, first = len(self._without_depth), self._without_depth[0]
             reconstruction.notes.append(f"Frames that went without depth because the prior failed: {count}; {first}.")
         self._thumbnails.attach(reconstruction.frames)
-        self.close()
         return reconstruction
 
     def close(self) -> None:
@@ -321,14 +281,6 @@ class Stream:
         if self._blas_limit is not None:
             self._blas_limit.restore_original_limits()
             self._blas_limit = None
-
-    def __enter__(self) -> Stream:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _keep_in_sight(self, image: MappedImage, grey: NDArray[np.uint8], pixels: NDArray[np.float64]) -> None:
         """Find the view again where it was lost, and take up the tracks whose points it shows."""
@@ -445,17 +397,6 @@ class Stream:
             yield
         finally:
             self.seconds[stage] += time.perf_counter() - start
-
-
-def as_frame(frame: Frame | NDArray[np.uint8], index: int) -> Frame:
-    """A frame with a BGR image; an image alone becomes the frame number `index`.
-
-    Raises:
-        InputError: it is no image.
-    """
-    if not isinstance(frame, Frame):
-        frame = Frame(index, frame, f"{index:06d}", None)
-    return replace(frame, image=bgr_image(frame.image, frame.index))
 
 
 def _mark_blank(image: MappedImage, texture: float) -> None:

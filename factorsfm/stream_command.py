@@ -19,13 +19,14 @@ from factorsfm.camera import camera_to_json, read_camera
 from factorsfm.episode import Episode, ShotResult
 from factorsfm.errors import InputError, ReconstructionError
 from factorsfm.export.folder import check_directory, write_failure, write_folder
+from factorsfm.frame_update import FrameUpdate
 from factorsfm.frames import Frame, parse_range
 from factorsfm.options import Options
 from factorsfm.priors.depth import DepthPrior, open_depth
 from factorsfm.priors.masks import MaskPrior, open_masks
 from factorsfm.reconstruction import Reconstruction
 from factorsfm.sources import RawFormat, Source, open_source
-from factorsfm.stream import FrameUpdate, Stream
+from factorsfm.stream import Stream
 from factorsfm.summary import conclusion, verdict
 from factorsfm.viewer import Viewer, open_viewer
 

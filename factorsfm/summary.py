@@ -73,9 +73,7 @@ def failure_summary(
 
 def verdict(reconstruction: Reconstruction) -> str:
     """What has been recovered, in one sentence for the user."""
-    frames, registered = len(reconstruction.frames), len(reconstruction.registered)
-    share = f"all {frames} frames" if registered == frames else f"{registered} of {frames} frames"
-    sentence = f"{share} registered, {len(reconstruction.points):,} points"
+    sentence = f"{registered_share(reconstruction)} registered, {len(reconstruction.points):,} points"
     error = median_reprojection_error(reconstruction)
     if math.isfinite(error):
         sentence += f", median reprojection error {error:.2f} px"
@@ -83,6 +81,12 @@ def verdict(reconstruction: Reconstruction) -> str:
         return f"{sentence}, parallax {reconstruction.parallax:.3f}"
     motion = "pure rotation" if reconstruction.kind is ShotKind.ROTATION else "static camera"
     return f"{sentence}; {motion}, no parallax"
+
+
+def registered_share(reconstruction: Reconstruction) -> str:
+    """All frames, or so many of them."""
+    frames, registered = len(reconstruction.frames), len(reconstruction.registered)
+    return f"all {frames} frames" if registered == frames else f"{registered} of {frames} frames"
 
 
 def conclusion(reconstruction: Reconstruction, output: Path) -> str:

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections import deque
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.closing import Closing
 from factorsfm.errors import InputError
+from factorsfm.frame_update import FrameUpdate
 from factorsfm.frames import Frame
 from factorsfm.priors.depth import DepthKind, DepthMap, DepthPrior
 from factorsfm.reconstruction import Reconstruction
-from factorsfm.stream import FrameUpdate, Stream
+from factorsfm.stream import Stream
 
 _JPEG_QUALITY = 80
 _PATH_FRAMES = 240  # of the path as it was given that are shown
@@ -24,7 +25,7 @@ _CAMERA = "world/camera"
 _IMAGE = f"{_CAMERA}/image"
 
 
-class Viewer:
+class Viewer(Closing):
     """Shows nothing; what a stream has unless a viewer was asked for."""
 
     def watch(self, depth: DepthPrior | None) -> DepthPrior | None:
@@ -39,14 +40,6 @@ class Viewer:
 
     def close(self) -> None:
         """Write what has not been written yet."""
-
-    def __enter__(self) -> Viewer:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 def open_viewer(show: bool = False, record: str | Path | None = None) -> Viewer:

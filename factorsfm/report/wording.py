@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from factorsfm.reconstruction import FrameResult, FrameStatus, Reconstruction, ShotKind
-from factorsfm.summary import median_reprojection_error
+from factorsfm.summary import median_reprojection_error, registered_share
 
 _DOUBTFUL_PX = 1.0  # median reprojection error; tracks are good to a tenth of a pixel
 _NO_SHARE = 0.05  # of the depth prior, below which it is not worth a word
@@ -41,9 +41,7 @@ def grade(reconstruction: Reconstruction) -> str:
 
 def verdict_sentence(reconstruction: Reconstruction) -> str:
     """What has been solved and how well it sits on the footage, in one sentence."""
-    frames, solved = len(reconstruction.frames), len(reconstruction.registered)
-    where = f"all {frames} frames" if solved == frames else f"{solved} of {frames} frames"
-    sentence = f"The camera is solved in {where}"
+    sentence = f"The camera is solved in {registered_share(reconstruction)}"
     error = median_reprojection_error(reconstruction)
     if np.isfinite(error):
         sentence += f", and half of the tracked points land within {error:.2f} pixels of where the footage shows them"

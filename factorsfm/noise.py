@@ -1,0 +1,61 @@
+"""How large the errors of tracks are, and how far they repeat each other."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorsfm.problem import Observations
+
+Array = NDArray[np.float64]
+
+SMALLEST_SIGMA_PX = 0.03  # no track is better than this
+_RAYLEIGH_MEDIAN = 1.1774  # median of the norm of a 2-D error, in standard deviations
+_BLOCKS = (8, 5, 16)  # across, down, frames: in which errors may be alike
+_LEAST_PAIRS = 100
+
+
+def typical_sigma(errors: Array) -> float:
+    """Standard deviation of a coordinate, from the lengths (n,) of 2-D errors with outliers."""
+    return float(np.median(errors)) / _RAYLEIGH_MEDIAN
+
+
+def temporal_inflation(residual: Array, observations: Observations) -> float:
+    """By how much the errors of a track in neighbouring frames repeat each other, as a factor on the variance.
+
+    Args:
+        residual: (m, 2) predicted minus observed position of each observation.
+    """
+    next_one = (np.diff(observations.point) == 0) & (np.diff(observations.frame) == 1)
+    if next_one.sum() < _LEAST_PAIRS:
+        return 1.0
+    inlier = _inliers(residual)
+    pair = np.nonzero(next_one & inlier[:-1] & inlier[1:])[0]
+    a, b = residual[pair], residual[pair + 1]
+    power = float(np.sqrt((a * a).sum() * (b * b).sum()))
+    correlation = float((a * b).sum()) / max(power, 1e-12)
+    correlation = min(max(correlation, 0.0), 0.9)
+    return (1.0 + correlation) / (1.0 - correlation)
+
+
+def block_inflation(residual: Array, observations: Observations) -> float:
+    """By how much errors of neighbouring tracks in neighbouring frames repeat each other: a factor on the variance.
+
+    In a block of the image and of time, independent errors add up to the root of their number.
+
+    Args:
+        residual: (m, 2) predicted minus observed position of each observation.
+    """
+    o, inlier = observations, _inliers(residual)
+    low, high = o.xy.min(0), o.xy.max(0)
+    cell = (0.999 * (o.xy - low) / np.maximum(high - low, 1e-9) * _BLOCKS[:2]).astype(np.int64)
+    key = ((o.frame // _BLOCKS[2]) * _BLOCKS[1] + cell[:, 1]) * _BLOCKS[0] + cell[:, 0]
+    key, residual = key[inlier], residual[inlier]
+    sums = [np.bincount(key, residual[:, axis]) for axis in range(2)]
+    power = float((residual**2).sum())
+    return max(1.0, float((sums[0] ** 2 + sums[1] ** 2).sum()) / max(power, 1e-12))
+
+
+def _inliers(residual: Array) -> NDArray[np.bool_]:
+    size = np.linalg.norm(residual, axis=1)
+    return np.asarray(size < 3.0 * np.median(size))
