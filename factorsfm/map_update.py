@@ -31,8 +31,8 @@ _FREE_KEYFRAMES = 20  # that an update solves for; those before are constant
 _HELD_KEYFRAMES = 8  # constant ones that take part, with what they saw
 _LEAST_SHARED = 30  # landmarks by which a constant keyframe takes part
 _GROSS = 4.0  # times the threshold of an inlier: a young map is wrong, too, and long tracks are precious
-_YOUNG_ITERATIONS = 40  # divided by the number of keyframes
-_SOLVER = replace(PolishOptions(), tolerance=1e-4)
+_YOUNG_ITERATIONS = 20  # divided by the number of keyframes
+_SOLVER = replace(PolishOptions(), tolerance=1e-3)
 _LARGEST_SIGMA_PX = 3.0
 _ALIKE = 20.0  # tracks that count as one: the errors of neighbours are alike
 _LENS_KEYFRAMES = 6  # from which an unknown focal length is estimated

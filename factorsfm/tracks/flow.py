@@ -20,13 +20,15 @@ from numpy.typing import NDArray
 from factorsfm.options import TrackerOptions
 from factorsfm.tracks.patches import Array, BirthPatches, Image, in_parts
 
-_STATE = ("_texture", "_frame", "_next_id", "_ids", "_xy", "_born_at", "_velocity", "_ended")
+_STATE = ("_texture", "_frame", "_replenished", "_next_id", "_ids", "_xy", "_born_at", "_velocity", "_ended")
 BLANK_TEXTURE = 0.2  # grey levels
 _MOST_ENDED = 3000  # tracks that are remembered
 _REVIVAL_REACH = 2.0  # times that of a re-alignment: where a track should be is known less well
 _SCOUTS = 64  # tracks that tell how the camera's motion has changed
 _SURPRISE_PX, _SURPRISE_RATIO = 0.5, 3.0  # distance from the predicted place; and times that of the others
 _GRID = 24  # cells along the longer image side in which the local motion is estimated
+_CHECK_INTERVAL = 2  # frames: the way back of an alignment is tried in turn
+_REPLENISH_INTERVAL, _FEW = 3, 0.7  # frames between looking for corners, unless so small a share of the tracks is left
 _BLANK_SHARE = 0.2  # of the texture of the last frame; with less, a frame among others is black or a flash
 
 
@@ -62,6 +64,7 @@ class FlowTracker:
         self._previous: _Frame | None = None
         self._texture = 0.0  # of the previous image
         self._frame = 0
+        self._replenished = 0  # the frame in which tracks were started last
         self._next_id = 0
         self._ids = np.zeros(0, np.int64)
         self._xy = np.zeros((0, 2), np.float32)
@@ -194,8 +197,9 @@ class FlowTracker:
         new, ok = old.copy(), np.zeros(n, bool)
         if len(settled):
             start = self._predicted(previous, frame, settled)
+            checked = (self._ids[settled] + self._frame) % _CHECK_INTERVAL == 0
             new[settled], ok[settled] = self._patches.align(
-                grey, settled, start, o.realign_check_px, o.realign_reach_px, self._pool
+                grey, settled, start, o.realign_check_px, o.realign_reach_px, self._pool, checked
             )
             surprise = np.linalg.norm(new[settled] - start, axis=1)
             if ok.any():
@@ -264,6 +268,9 @@ class FlowTracker:
         room = o.max_tracks - len(self._ids)
         if room < o.max_tracks * o.replenish_below:
             return 0
+        if len(self._ids) > _FEW * o.max_tracks and self._frame - self._replenished < _REPLENISH_INTERVAL:
+            return 0
+        self._replenished = self._frame
         h, w = grey.shape
         free = np.zeros((h, w), np.uint8)
         free[o.border_px : h - o.border_px, o.border_px : w - o.border_px] = 255

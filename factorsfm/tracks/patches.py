@@ -84,19 +84,32 @@ class BirthPatches:
         self._affine = linear @ self._affine
 
     def align(
-        self, grey: Image, rows: Rows, start: Array, check_px: float, reach_px: float, pool: ThreadPoolExecutor
+        self,
+        grey: Image,
+        rows: Rows,
+        start: Array,
+        check_px: float,
+        reach_px: float,
+        pool: ThreadPoolExecutor,
+        checked: NDArray[np.bool_] | None = None,
     ) -> tuple[Array, NDArray[np.bool_]]:
-        """Align the patches of `rows` with a frame, from `start`; positions, and which of them can be trusted."""
+        """Align the patches of `rows` with a frame, from `start`; positions, and which of them can be trusted.
+
+        Args:
+            check_px: largest error of the way back, which only those that are `checked` (default: all) must find.
+            reach_px: largest distance from `start`.
+        """
+        checked = np.ones(len(rows), bool) if checked is None else checked
 
         def part(index: Rows) -> tuple[Array, NDArray[np.bool_]]:
-            return self._align(grey, rows[index], start[index], check_px, reach_px)
+            return self._align(grey, rows[index], start[index], check_px, reach_px, checked[index])
 
         tile = 2 * self._half + 1
         room = (grey.shape[0] // tile) * (grey.shape[1] // tile)
         return in_parts(part, len(rows), room, pool)
 
     def _align(
-        self, grey: Image, rows: Rows, start: Array, check_px: float, reach_px: float
+        self, grey: Image, rows: Rows, start: Array, check_px: float, reach_px: float, checked: NDArray[np.bool_]
     ) -> tuple[Array, NDArray[np.bool_]]:
         self._warp(rows)
         atlas, centers = _atlas(self._warped[rows], grey.shape)
@@ -104,13 +117,14 @@ class BirthPatches:
             atlas, grey, centers, start.copy(), winSize=self._window, maxLevel=0, criteria=_FINE,
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         )  # fmt: skip
-        back, status_back, _ = cv2.calcOpticalFlowPyrLK(
-            grey, atlas, aligned, centers.copy(), winSize=self._window, maxLevel=0, criteria=_BACK,
-            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        )  # fmt: skip
-        good = (status[:, 0] == 1) & (status_back[:, 0] == 1)
-        good &= np.linalg.norm(back - centers, axis=1) < check_px
-        good &= np.linalg.norm(aligned - start, axis=1) < reach_px
+        good = (status[:, 0] == 1) & (np.linalg.norm(aligned - start, axis=1) < reach_px)
+        check = np.nonzero(good & checked)[0]
+        if len(check):
+            back, status, _ = cv2.calcOpticalFlowPyrLK(
+                grey, atlas, aligned[check], centers[check], winSize=self._window, maxLevel=0, criteria=_BACK,
+                flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+            )  # fmt: skip
+            good[check] = (status[:, 0] == 1) & (np.linalg.norm(back - centers[check], axis=1) < check_px)
         return aligned, good
 
     def _warp(self, rows: Rows) -> None:
