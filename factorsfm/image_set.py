@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from factorsfm.camera import PIXEL_CENTER, guess_camera
 from factorsfm.errors import InputError, ReconstructionError
@@ -29,6 +28,7 @@ from factorsfm.reading import read_depth, read_mask
 from factorsfm.reconstruction import FrameResult, FrameStatus, Reconstruction
 from factorsfm.result import assemble
 from factorsfm.set_mapper import SetMapper
+from factorsfm.threads import OneThreadEach
 from factorsfm.tracks.matches import join_tracks, match_images
 
 Array = NDArray[np.float64]
@@ -167,7 +167,7 @@ class ImageSet:
         report("mapping", 0, None)
         focal = 0.5 * (camera.focal_length_x + camera.focal_length_y)
         mapper = SetMapper(tracks, focal, self.options)
-        with self._timed("mapping"), threadpool_limits(1, "blas"):
+        with self._timed("mapping"), OneThreadEach():
             mapper.run()
         self._explain(mapper.images)
         registered = sum(image.registered for image in mapper.images)
@@ -178,7 +178,7 @@ class ImageSet:
                 f"{self.photos[worst].name}: {mapper.images[worst].message}",
                 mapper.images,
             )
-        with self._timed("polish"), threadpool_limits(1, "blas"):
+        with self._timed("polish"), OneThreadEach():
             polished = polish(
                 mapper.images, mapper.points.all(), mapper.focal, self.options, lambda stage: report(stage, 0, None)
             )

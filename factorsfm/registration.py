@@ -27,6 +27,7 @@ _POSE = gtsam.symbol("x", 0)
 _AFFINE = gtsam.symbol("a", 0)
 _KERNEL = 2.0  # Cauchy scale in standard deviations
 _ALIGN_STEPS = 20  # at most
+_ROUGHLY, _FULLY = 1e-3, 1e-6  # relative decrease of the cost with which the alignment ends
 _BEHIND = 1e3  # residual of a point behind the camera, standard deviations
 _DEPTH_FLOOR = 0.03  # smallest believable relative error of a depth network
 
@@ -162,7 +163,13 @@ def _optimize(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.
 
 
 def _align(
-    points: Array, observed: Array, rotation: Array, translation: Array, focal: float, sigma: float
+    points: Array,
+    observed: Array,
+    rotation: Array,
+    translation: Array,
+    focal: float,
+    sigma: float,
+    tolerance: float = _FULLY,
 ) -> tuple[Array, Array, Array]:
     """Minimum of `image_reprojection_factor` over the pose, in numpy: it is asked for several times a frame.
 
@@ -183,7 +190,7 @@ def _align(
         costs, weight = cauchy(residual, _KERNEL)
         cost = float(costs.sum())
         if cost < best:
-            settled = best - cost < 1e-6 * cost
+            settled = best - cost < tolerance * cost
             rotation, translation = candidate
             best, damping = cost, damping / 10.0
             if settled:
@@ -211,9 +218,9 @@ def _refine(
     """Robust pose; the kernel follows the spread of the residuals, since a young map is not yet exact."""
     error = _residuals(points, observed, rotation, translation, focal)
     information = np.eye(6)
-    for _ in range(2):
+    for tolerance in (_ROUGHLY, _FULLY):
         spread = min(max(sigma, _typical(error)), 100.0 * sigma)
-        rotation, translation, information = _align(points, observed, rotation, translation, focal, spread)
+        rotation, translation, information = _align(points, observed, rotation, translation, focal, spread, tolerance)
         error = _residuals(points, observed, rotation, translation, focal)
     threshold = max(inlier_px, min(4.0 * _typical(error), 8.0 * inlier_px))
     inliers = error < threshold

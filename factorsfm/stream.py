@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from factorsfm.camera import (
     camera_from_json,
@@ -43,6 +42,7 @@ from factorsfm.relocalization import Relocalizer
 from factorsfm.report.thumbnails import Thumbnails
 from factorsfm.result import assemble
 from factorsfm.snapshot import read_snapshot, write_snapshot
+from factorsfm.threads import OneThreadEach
 from factorsfm.tracks.flow import BLANK_TEXTURE, FlowTracker
 
 logger = logging.getLogger(__name__)
@@ -94,7 +94,7 @@ class Stream(Closing):
         self._tracker = FlowTracker(self.options.tracker)
         self._relocalizer = Relocalizer()
         self._thumbnails = Thumbnails()
-        self._blas_limit: threadpool_limits | None = None
+        self._threads: OneThreadEach | None = None
         self._mapper: Mapper | None = None
         self._size = (0, 0)
         self._colors = np.zeros((0, 3), np.uint8)
@@ -278,9 +278,8 @@ class Stream(Closing):
         """Give up without a result; `finish` closes, too."""
         if self._mapper is not None:
             self._mapper.close()
-        if self._blas_limit is not None:
-            self._blas_limit.restore_original_limits()
-            self._blas_limit = None
+        if self._threads is not None:
+            self._threads.close()
 
     def _keep_in_sight(self, image: MappedImage, grey: NDArray[np.uint8], pixels: NDArray[np.float64]) -> None:
         """Find the view again where it was lost, and take up the tracks whose points it shows."""
@@ -331,8 +330,7 @@ class Stream(Closing):
 
     def _new_mapper(self) -> Mapper:
         assert self.camera is not None
-        # The matrices are small: on busy cores BLAS threads would spend nearly all the time waiting for each other.
-        self._blas_limit = threadpool_limits(1, "blas")
+        self._threads = OneThreadEach()
         focal = 0.5 * (self.camera.focal_length_x + self.camera.focal_length_y)
         return Mapper(focal, self._size[0], self.options, has_prior=self._depth is not None)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -162,10 +163,12 @@ def _checked_margin(margin: float) -> float:
 def _fitted(ignore: NDArray[np.bool_], frame: Frame, margin: float) -> NDArray[np.bool_]:
     """The mask at the frame's size, grown by the margin."""
     height, width = frame.image.shape[:2]
-    mask = cv2.resize(ignore.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
-    radius = round(margin * width)
+    mask = ignore.astype(np.uint8)
+    # Grown before it is enlarged: there are fewer pixels then.
+    radius = math.ceil(round(margin * width) * mask.shape[1] / width)
     if radius > 0:
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
         mask = cv2.dilate(mask, disc)
+    mask = cv2.resize(mask, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
     result: NDArray[np.bool_] = mask.astype(np.bool_)
     return result

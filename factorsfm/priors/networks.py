@@ -166,6 +166,7 @@ def _open_session(path: Path) -> Any:
         raise ModelError(f"there is no network file {path}")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 2
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # the cores have other work between frames
     options.log_severity_level = 4  # failures come back as exceptions; nothing goes to stderr
     try:
         return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])

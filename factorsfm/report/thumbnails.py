@@ -62,11 +62,10 @@ class Thumbnails:
 
 
 def thumbnail(image: NDArray[np.uint8]) -> bytes:
-    """A JPEG, 384 pixels wide or as wide as the image where that is smaller."""
+    """A JPEG at most 384 pixels wide: whole pixels are averaged, which is several times as fast as other ratios."""
     height, width = image.shape[:2]
-    if width > _WIDTH:
-        image = np.asarray(
-            cv2.resize(image, (_WIDTH, max(1, round(height * _WIDTH / width))), interpolation=cv2.INTER_AREA)
-        )
+    if (block := -(-width // _WIDTH)) > 1:
+        size = width // block, max(1, height // block)
+        image = np.asarray(cv2.resize(image[: size[1] * block, : size[0] * block], size, interpolation=cv2.INTER_AREA))
     _, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
     return jpeg.tobytes()

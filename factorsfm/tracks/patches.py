@@ -15,10 +15,11 @@ Image = NDArray[np.uint8]
 Rows = NDArray[np.intp]
 
 _SUPPORT = 22  # half side of a stored patch: the window at half the birth's scale, with its margin
-_MARGIN = 2  # of a warped patch around the window: interpolation and derivative
+_MARGIN = 1  # of a warped patch around the window: interpolation and derivative
 _STALE_PX = 0.05  # change of the map at the edge of the window with which a patch is warped again
 _STOP = cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS
 _FINE = (_STOP, 20, 0.003)
+_ALL_GOOD = 0.7  # share of the checked ones that must come back, or the others are checked, too
 _BACK = (_STOP, 5, 0.03)  # the way back only has to tell whether it ends where it began
 
 
@@ -96,7 +97,8 @@ class BirthPatches:
         """Align the patches of `rows` with a frame, from `start`; positions, and which of them can be trusted.
 
         Args:
-            check_px: largest error of the way back, which only those that are `checked` (default: all) must find.
+            check_px: largest error of the way back; those that are not `checked` (default: all are) must find it only
+                where too many others do not.
             reach_px: largest distance from `start`.
         """
         checked = np.ones(len(rows), bool) if checked is None else checked
@@ -118,13 +120,20 @@ class BirthPatches:
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         )  # fmt: skip
         good = (status[:, 0] == 1) & (np.linalg.norm(aligned - start, axis=1) < reach_px)
-        check = np.nonzero(good & checked)[0]
-        if len(check):
+
+        def stays(index: Rows) -> NDArray[np.bool_]:
+            """Whether the way back ends where it began."""
             back, status, _ = cv2.calcOpticalFlowPyrLK(
-                grey, atlas, aligned[check], centers[check], winSize=self._window, maxLevel=0, criteria=_BACK,
+                grey, atlas, aligned[index], centers[index], winSize=self._window, maxLevel=0, criteria=_BACK,
                 flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
             )  # fmt: skip
-            good[check] = (status[:, 0] == 1) & (np.linalg.norm(back - centers[check], axis=1) < check_px)
+            return np.asarray((status[:, 0] == 1) & (np.linalg.norm(back - centers[index], axis=1) < check_px))
+
+        some, rest = np.nonzero(good & checked)[0], np.nonzero(good & ~checked)[0]
+        if len(some):
+            good[some] = stays(some)
+        if len(rest) and (not len(some) or good[some].mean() < _ALL_GOOD):
+            good[rest] = stays(rest)
         return aligned, good
 
     def _warp(self, rows: Rows) -> None:
