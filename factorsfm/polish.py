@@ -28,6 +28,7 @@ logger = logging.getLogger(__name__)
 
 _FIRST_SIGMA_PX = 0.25
 _DOUBTFUL_INFLATION = 5.0  # sound solutions have 1 to 3.5
+_CLEARLY = 0.9  # of the cost of the incremental map's solution, at which another start is preferred
 _CORE_TRACKS = 400  # tracks with which the cameras converge first
 _TRIANGULATION_VIEWS = 10
 
@@ -238,9 +239,17 @@ def _converge_cameras(
         or temporal_inflation(best.reprojection_vectors(), few) > _DOUBTFUL_INFLATION
     ):
         logger.info("the solution does not fit (%.2f px), trying other starts", best.sigma)
-        best = min(best, _solve_core(_flat(part, few, options.polish), few, options), key=lambda b: b.sigma)
-        best = min(best, _solve_core(_reversed(best.state), few, options), key=lambda b: b.sigma)
+        best = _better(best, _solve_core(_flat(part, few, options.polish), few, options))
+        best = _better(best, _solve_core(_reversed(best.state), few, options))
     return core, few, best
+
+
+def _better(known: BundleAdjustment, other: BundleAdjustment) -> BundleAdjustment:
+    """The other solution where it fits clearly better, at one scale of the errors: a median alone may be chance."""
+    cost, other_cost = (
+        BundleAdjustment(b.state, b.observations, b.options, sigma=known.sigma).cost() for b in (known, other)
+    )
+    return other if other_cost < _CLEARLY * cost else known
 
 
 def _solve_core(part: State, few: Observations, options: Options) -> BundleAdjustment:
