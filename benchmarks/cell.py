@@ -53,6 +53,7 @@ class Estimate:
         indices: (n,); rotations: (n, 3, 3); centers: (n, 3).
         frame: (m,) row in `indices` of each observation; xy: (m, 2) pixels; depth: (m,) z in that camera.
         facts: see `Record.facts`.
+        given: rotations and centres as they were given frame by frame, where the method gives them.
     """
 
     indices: NDArray[np.int64]
@@ -62,6 +63,7 @@ class Estimate:
     xy: Array
     depth: Array
     facts: dict[str, Any]
+    given: tuple[Array, Array] | None = None
 
 
 def measure(cell: Cell, folders: Folders) -> Record:
@@ -97,7 +99,10 @@ def judge(cell: Cell, shot: Shot, estimate: Estimate) -> Record:
         parts.append(point_depth_errors(estimate.xy[seen], estimate.depth[seen], truth, size, alignment.scale))
     depths = DepthErrors.pool(parts)
     known = np.isfinite(depths.truth)
-    return _record(cell, shot, rotations, centers, estimate.facts, depths.estimate[known], depths.truth[known])
+    record = _record(cell, shot, rotations, centers, estimate.facts, depths.estimate[known], depths.truth[known])
+    if estimate.given is not None:
+        record.arrays["given_rotations"], record.arrays["given_centers"] = estimate.given
+    return record
 
 
 def unregistered(cell: Cell, shot: Shot, reason: str) -> Record:
@@ -142,11 +147,10 @@ def _factorsfm(cell: Cell, shot: Shot, folders: Folders) -> Estimate:
             images = ImageSet(Path(folder), shot.camera, depth=depth, masks=masks, options=options)
             for frame in frames:
                 images.add(frame)
-            result = images.finish()
+            result, given = images.finish(), None
     else:
         stream = Stream(shot.camera, depth=depth, masks=masks, options=options)
-        for frame in frames:
-            stream.push(frame)
+        given = pose_arrays([stream.push(frame).cam_from_world for frame in frames])
         result = stream.finish()
     with tempfile.TemporaryDirectory(prefix="result-") as folder:
         start = time.perf_counter()
@@ -154,10 +158,10 @@ def _factorsfm(cell: Cell, shot: Shot, folders: Folders) -> Estimate:
         end = time.perf_counter()
     seconds = {**result.seconds, "writing": end - start}
     seconds["reading and rest"] = end - begin - sum(seconds.values())
-    return _estimate(result, {**seconds, "total": end - begin})
+    return _estimate(result, {**seconds, "total": end - begin}, given)
 
 
-def _estimate(result: Reconstruction, seconds: Mapping[str, float]) -> Estimate:
+def _estimate(result: Reconstruction, seconds: Mapping[str, float], given: tuple[Array, Array] | None) -> Estimate:
     rotations, centers = pose_arrays([frame.cam_from_world for frame in result.frames])
     rays = result.points[result.observation_point] - centers[result.observation_frame]
     return Estimate(
@@ -173,6 +177,7 @@ def _estimate(result: Reconstruction, seconds: Mapping[str, float]) -> Estimate:
             "notes": result.notes,
             "points": len(result.points),
         },
+        given=given,
     )
 
 

@@ -15,6 +15,7 @@ from factorsfm.evaluation.metrics import (
     RELATIVE_POSE_THRESHOLDS,
     T_RPE_THRESHOLDS,
     DepthErrors,
+    TrajectoryErrors,
     auc,
     relative_pose_errors,
 )
@@ -76,7 +77,10 @@ def _ranked(records: Records, largest: bool) -> list[Record]:
 
 def pooled_errors(records: Records) -> tuple[Array, Array, Array]:
     """ATE, T-RPE and R-RPE of all frames of the records."""
-    errors = [record.errors for record in records]
+    return _pooled([record.errors for record in records])
+
+
+def _pooled(errors: Sequence[TrajectoryErrors]) -> tuple[Array, Array, Array]:
     return (
         np.concatenate([e.ate for e in errors]),
         np.concatenate([e.t_rpe for e in errors]),
@@ -86,12 +90,18 @@ def pooled_errors(records: Records) -> tuple[Array, Array, Array]:
 
 def pose_aucs(records: Records) -> list[float]:
     """The six columns of the paper's table, pooled over all frames."""
+    return _aucs(*pooled_errors(records))
+
+
+def given_aucs(records: Records) -> list[float] | None:
+    """The same for the poses as they were given frame by frame; None where a record has none."""
+    errors = [found for record in records if (found := record.given_errors) is not None]
+    return _aucs(*_pooled(errors)) if len(errors) == len(records) else None
+
+
+def _aucs(*pooled: Array) -> list[float]:
     thresholds = (ATE_THRESHOLDS, T_RPE_THRESHOLDS, R_RPE_THRESHOLDS)
-    return [
-        auc(errors, limit)
-        for errors, limits in zip(pooled_errors(records), thresholds, strict=True)
-        for limit in limits
-    ]
+    return [auc(errors, limit) for errors, limits in zip(pooled, thresholds, strict=True) for limit in limits]
 
 
 def pooled_depth(records: Records) -> dict[str, float]:

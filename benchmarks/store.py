@@ -37,7 +37,8 @@ class Record:
         facts: plain data: `failed` (the reason, or None), `seconds` by stage with `total`, `cpu_seconds`,
             `peak_mb`, `load` (of the machine at the start), `parallax`, `kind`, `notes`, `settings`, `points`.
         arrays: `indices` (n,), `rotations` (n, 3, 3) and `centers` (n, 3) with NaN where not registered,
-            `true_rotations`, `true_centers`, the errors `ate` (n,), `t_rpe`, `r_rpe` (n - 1,), and `depth`,
+            `true_rotations`, `true_centers`, of a stream `given_rotations` and `given_centers` as the poses were known
+            right after each frame, the errors `ate` (n,), `t_rpe`, `r_rpe` (n - 1,), and `depth`,
             `true_depth` (m,) of the observed points in metres.
     """
 
@@ -50,6 +51,14 @@ class Record:
         """Errors of the poses, from the poses, so that a change of the metrics needs no new run."""
         a = self.arrays
         return trajectory_errors(a["rotations"], a["centers"], a["true_rotations"], a["true_centers"])
+
+    @property
+    def given_errors(self) -> TrajectoryErrors | None:
+        """Errors of the poses as they were given frame by frame; None where the method waits for the whole shot."""
+        a = self.arrays
+        if "given_centers" not in a:
+            return None
+        return trajectory_errors(a["given_rotations"], a["given_centers"], a["true_rotations"], a["true_centers"])
 
     @property
     def rotation_errors(self) -> Array:

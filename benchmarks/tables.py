@@ -17,6 +17,7 @@ from benchmarks.scores import (
     Records,
     by_label,
     by_shot,
+    given_aucs,
     largest_parallax,
     parallax_of,
     pooled_depth,
@@ -86,6 +87,21 @@ def pose_table(records: Records) -> str:
         within = pooled_depth(members)["within 5%"], within_at_own_scale(members)
         rows.append([*_names(label), len(members), *pose_aucs(members), registered, *within])
     return table(["method", "prior", "shots", *POSE, "frames registered %", *WITHIN], rows, max)
+
+
+def given_table(records: Records) -> list[str]:
+    """The six AUC columns of the poses as they were known right after each frame; nothing where no method gives any."""
+    rows = [
+        [*_names(label), len(members), *columns]
+        for label, members in by_label(records).items()
+        if (columns := given_aucs(members)) is not None
+    ]
+    if not rows:
+        return []
+    return [
+        "As they were given frame by frame; a frame for which the method still waits counts as an infinite error.",
+        table(["method", "prior", "shots", *POSE], rows, max),
+    ]
 
 
 def shot_tables(records: Records) -> list[str]:
@@ -187,19 +203,19 @@ def _split(records: Records, output: Path) -> list[str]:
     parts = []
     for title, shots in (("Rendered shots", STUDIO), ("Kitchen clips", KITCHEN)):
         if members := [r for r in records if r.cell.shot in shots]:
-            parts += [f"### {title}", pose_table(members), *shot_tables(members)]
+            parts += [f"### {title}", pose_table(members), *given_table(members), *shot_tables(members)]
     return parts
 
 
 def _pooled(records: Records, output: Path) -> list[str]:
-    return [pose_table(records), *shot_tables(records)]
+    return [pose_table(records), *given_table(records), *shot_tables(records)]
 
 
 def _degraded(records: Records, output: Path) -> list[str]:
     parts = []
     for variant, members in _group(records, lambda r: r.cell.variant).items():
         what = "Gaussian blur 1 px, noise sigma 8, JPEG quality 40" if variant == DEGRADED else "H.264 at CRF 30"
-        parts += [f"### {what}", pose_table(members), *shot_tables(members)]
+        parts += [f"### {what}", pose_table(members), *given_table(members), *shot_tables(members)]
     return parts
 
 
