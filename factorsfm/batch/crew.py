@@ -123,7 +123,7 @@ def _processes(count: int) -> Iterator[Executor]:
     except BaseException:
         pool.shutdown(wait=False, cancel_futures=True)
         for child in set(multiprocessing.active_children()) - before:
-            child.terminate()  # at Ctrl-C nobody waits for the end of a shot
+            child.kill()  # at Ctrl-C nobody waits for the end of a shot; libraries complain of softer signals
         raise
     pool.shutdown()
 
