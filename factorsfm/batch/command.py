@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -21,6 +22,8 @@ from factorsfm.priors.masks import open_masks
 from factorsfm.summary import json_text
 
 Show = Callable[[str], None]
+
+logger = logging.getLogger(__name__)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -117,6 +120,7 @@ def _reconstruct(crew: Crew, work: Callable[[Job], None], jobs: Sequence[Job], i
     line = _Line(show, jobs, waiting)
     for job, outcome in crew.run(work, waiting):
         if isinstance(outcome, BaseException):
+            logger.info("%s failed", job.folder, exc_info=outcome)
             said = str(outcome) if isinstance(outcome, FactorsfmError) else f"{type(outcome).__name__}: {outcome}"
             # Without the job beside it, so that the next run tries again.
             write_failure(job.folder, said, options={"source": str(job.video.path)})
