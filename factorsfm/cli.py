@@ -13,6 +13,7 @@ from types import TracebackType
 from typing import Any, NoReturn, TextIO
 
 from factorsfm import api, demo, stream_command
+from factorsfm.batch import command as batch_command
 from factorsfm.camera import read_camera
 from factorsfm.errors import FactorsfmError, ReconstructionError
 from factorsfm.export import command as export_command
@@ -45,6 +46,10 @@ def main(argv: Sequence[str] | None = None) -> int:
                 print(export_command.run(arguments))
             elif arguments.command == "stream":
                 said = stream_command.run(arguments, progress, progress.show)
+                progress.clear()
+                print(said)
+            elif arguments.command == "batch":
+                said = batch_command.run(arguments, progress, progress.show)
                 progress.clear()
                 print(said)
             elif arguments.command == "overlay":
@@ -185,6 +190,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     reconstruct.add_argument("source", metavar="SOURCE", help="a video file, or a folder of images")
     _add_shot_arguments(reconstruct)
+    _add_range(reconstruct)
     reconstruct.add_argument(
         "--unordered",
         action="store_true",
@@ -205,7 +211,19 @@ def _parser() -> argparse.ArgumentParser:
     )
     stream_command.add_source(stream)
     _add_shot_arguments(stream)
+    _add_range(stream)
     stream_command.add_arguments(stream)
+
+    batch = commands.add_parser(
+        "batch",
+        parents=[common],
+        help="reconstruct every shot of a film, or of a folder of films",
+        description="Find the shots of a film, or of all films in a folder, and reconstruct each; goes on where it was "
+        "interrupted.",
+    )
+    batch.add_argument("source", metavar="SOURCE", help="a video file, or a folder of video files")
+    _add_shot_arguments(batch, output="folder of the results: new, empty, or that of an earlier run, which goes on")
+    batch_command.add_arguments(batch)
 
     demo_command = commands.add_parser(
         "demo",
@@ -239,15 +257,12 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _add_shot_arguments(parser: argparse.ArgumentParser) -> None:
+_RESULT = "folder of the result: new, empty, or holding an earlier result, which is replaced"
+
+
+def _add_shot_arguments(parser: argparse.ArgumentParser, output: str = _RESULT) -> None:
     """What a shot is reconstructed with, and where the result goes."""
-    parser.add_argument(
-        "--output",
-        type=Path,
-        required=True,
-        metavar="DIR",
-        help="folder of the result: new, empty, or holding an earlier result, which is replaced",
-    )
+    parser.add_argument("--output", type=Path, required=True, metavar="DIR", help=output)
     parser.add_argument(
         "--camera", type=Path, metavar="FILE.json", help="width, height, fx, fy, cx, cy; default: estimated"
     )
@@ -267,5 +282,8 @@ def _add_shot_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FOLDER|MODEL.onnx|none",
         help="what moves and is to be ignored: non-zero in the masks (default: none)",
     )
-    parser.add_argument("--frames", metavar="START:STOP[:STEP]", help="counted from 0, without STOP")
     parser.add_argument("--preset", choices=list(PRESETS), default="default", help="default: %(default)s")
+
+
+def _add_range(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--frames", metavar="START:STOP[:STEP]", help="counted from 0, without STOP")

@@ -8,7 +8,7 @@ import os
 import re
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -190,12 +190,17 @@ def as_frame(frame: Frame | NDArray[np.uint8], index: int) -> Frame:
 
 def list_images(folder: Path) -> list[Path]:
     """Images of a folder in natural order, img2 before img10; none is no error."""
-    images = [
+    return list_files(folder, IMAGE_SUFFIXES)
+
+
+def list_files(folder: Path, suffixes: Collection[str]) -> list[Path]:
+    """Files of a folder with one of these suffixes (lower case) in natural order; none is no error."""
+    found = [
         path
         for path in folder.iterdir()
-        if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".") and path.is_file()
+        if path.suffix.lower() in suffixes and not path.name.startswith(".") and path.is_file()
     ]
-    return sorted(images, key=_natural_key)
+    return sorted(found, key=_natural_key)
 
 
 def _natural_key(path: Path) -> tuple[list[str | int], str]:

@@ -102,8 +102,9 @@ def camera_observability(
     share, share_view_axis = _prior_shares(adjustment, marginals)
     angle = np.degrees(triangulation_angles(state, o))
     near = state.inverse_distance[o.point] / state.camera_points(o.frame, o.point)[:, 2]
-    depth = 1.0 / np.maximum(_median_by_frame(near, o), 1e-9)
-    columns = [share, share_view_axis, _median_by_frame(angle[o.point], o)]
+    cameras = len(state.rotation)
+    depth = 1.0 / np.maximum(_median_by_frame(near, o, cameras), 1e-9)
+    columns = [share, share_view_axis, _median_by_frame(angle[o.point], o, cameras)]
     columns.append(pixel_slide(pose_blocks(covariance, len(depth)), depth, float(np.exp(state.log_focal))))
     return [CameraObservability(*row) for row in np.stack(columns, 1).tolist()]
 
@@ -166,8 +167,8 @@ def pixel_slide(covariance: Array, depth: Array, focal: float) -> Array:
     return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(image)[:, -1], 0.0)))
 
 
-def _median_by_frame(values: Array, observations: Observations) -> Array:
-    by_frame = (values[observations.frame == k] for k in range(observations.frame.max() + 1))
+def _median_by_frame(values: Array, observations: Observations, frames: int) -> Array:
+    by_frame = (values[observations.frame == k] for k in range(frames))
     return np.array([np.median(mine) if len(mine) else np.nan for mine in by_frame])
 
 

@@ -128,6 +128,16 @@ def test_the_adjustment_is_left_as_it_was():
     np.testing.assert_array_equal(adjustment.state.translation, before.translation)
 
 
+def test_a_last_camera_that_has_lost_its_observations():
+    problem = shot("truck")
+    o = problem.observations
+    kept = o.frame != problem.frames - 1
+    rest = replace(o, frame=o.frame[kept], point=o.point[kept], xy=o.xy[kept])
+    adjustment = BundleAdjustment(problem.truth, rest, OPTIONS, sigma=0.1)
+    last = observed(adjustment)[-1]
+    assert (len(observed(adjustment)), np.isnan(last.triangulation_angle_deg)) == (problem.frames, True)
+
+
 # --- the prior's share ------------------------------------------------------------------------------------------
 
 

@@ -25,7 +25,7 @@ from factorsfm.synthetic import render_shot, write_shot
 ROOT = Path(__file__).resolve().parents[1]
 TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
-COMMANDS = ("reconstruct", "stream", "export", "overlay", "demo")
+COMMANDS = ("reconstruct", "stream", "batch", "export", "overlay", "demo")
 FRAMES = 10
 FILES = {"trajectory.tum", "colmap", "points.ply", "summary.json", "report.html"}
 
@@ -68,6 +68,7 @@ def material(tmp_path_factory: pytest.TempPathFactory) -> Path:
     nodes = [brightness, helper.make_node("Softplus", ["mean"], ["out"])]
     network = save_network(folder / "network.onnx", [1, 3, 48, 80], nodes)
     shutil.copy(network, folder / "networks" / models.MODELS["tcmonodepth"].file)
+    shutil.copy(folder / "shot.mp4", folder / "film.mp4")
     (folder / "frames.bgr").write_bytes(np.stack(shot.images).tobytes())
     camera, depth = read_camera(folder / "camera.json"), folder / "depth"
     reconstruct(folder / "shot.mp4", camera=camera, depth=depth, depth_kind="inverse").write(folder / "result")
@@ -102,6 +103,10 @@ def test_command(block: Block, place: Path, monkeypatch: pytest.MonkeyPatch) -> 
             assert {path.name for path in output.iterdir()} == FILES
             summary = json.loads((output / "summary.json").read_text())
             assert summary["registered"] == summary["frames"] == FRAMES
+        elif words[1] == "batch":
+            assert {path.name for path in (output / "film" / "shot_001").iterdir()} == FILES
+            index = json.loads((output / "index.json").read_text())
+            assert (index["reconstructed"], index["registered"], index["frames"]) == (1, FRAMES, FRAMES)
         elif output.is_dir():
             assert any(output.iterdir())
         else:
@@ -162,7 +167,10 @@ def test_every_option_and_value_is_described(capsys: pytest.CaptureFixture[str])
         assert f"\n| {status} | " in TEXT
 
 
-@pytest.mark.parametrize(("heading", "commands"), [("Streaming", ["reconstruct", "stream"]), ("Export", ["export"])])
+@pytest.mark.parametrize(
+    ("heading", "commands"),
+    [("Streaming", ["reconstruct", "stream"]), ("Films", ["reconstruct", "batch"]), ("Export", ["export"])],
+)
 def test_a_section_names_the_options_of_its_command(
     heading: str, commands: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:

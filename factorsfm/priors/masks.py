@@ -58,6 +58,10 @@ class MaskFolder:
         self.name = Path(path).name
         self.asked = self.matched = 0
 
+    def has(self, index: int) -> bool:
+        """Whether the folder has a mask for this frame of a video."""
+        return self._files.find(Frame(index, np.empty((0, 0, 3), np.uint8), f"{index:06d}")) is not None
+
     def __call__(self, frame: Frame) -> NDArray[np.bool_] | None:
         """The mask of a frame, None where the folder has none for it.
 

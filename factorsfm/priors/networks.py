@@ -165,7 +165,7 @@ def _open_session(path: Path) -> Any:
     if not path.is_file():
         raise ModelError(f"there is no network file {path}")
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 2
+    options.intra_op_num_threads = min(2, cv2.getNumThreads())  # one where the process keeps to one
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # the cores have other work between frames
     options.log_severity_level = 4  # failures come back as exceptions; nothing goes to stderr
     try:

@@ -30,13 +30,17 @@ def status_words(status: FrameStatus) -> str:
 
 def grade(reconstruction: Reconstruction) -> str:
     """The verdict in one to three words."""
-    if not reconstruction.registered:
+    error = median_reprojection_error(reconstruction)
+    return grade_of(len(reconstruction.registered), len(reconstruction.frames), error)
+
+
+def grade_of(registered: int, frames: int, error_px: float) -> str:
+    """The verdict on so many frames of a shot, with this median reprojection error (NaN: unknown)."""
+    if not registered:
         return "Not solved"
-    if _is_doubtful(reconstruction):
+    if error_px > _DOUBTFUL_PX:
         return "Doubtful"
-    if len(reconstruction.registered) < len(reconstruction.frames):
-        return "Solved in part"
-    return "Solved"
+    return "Solved" if registered == frames else "Solved in part"
 
 
 def verdict_sentence(reconstruction: Reconstruction) -> str:

@@ -1,0 +1,164 @@
+"""What there is to do: the videos, their shots, and one job for each of these."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pycolmap
+
+from factorsfm.camera import camera_to_json
+from factorsfm.errors import InputError
+from factorsfm.frames import list_files
+from factorsfm.priors.masks import MaskFolder
+from factorsfm.shots import find_shots
+from factorsfm.summary import json_text
+
+VIDEO_SUFFIXES = (
+    *(".avi", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg"),
+    *(".mpg", ".mts", ".mxf", ".ogv", ".ts", ".webm", ".wmv"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Method:
+    """What shots are reconstructed with; see `factorsfm.reconstruct`, files and folders as absolute paths."""
+
+    camera: pycolmap.Camera | None = None
+    depth: str | None = None
+    depth_kind: str | None = None
+    masks: str | None = None
+    preset: str = "default"
+
+    def of_video(self, name: str) -> Method:
+        """With what belongs to this video of several: folders of its name in those of maps and masks."""
+        depth, masks = self.depth, self.masks
+        if depth is not None and Path(depth).is_dir():
+            depth = str(Path(depth) / name)
+        if masks is not None and Path(masks).is_dir():
+            masks = str(Path(masks) / name) if (Path(masks) / name).is_dir() else None
+        return replace(self, depth=depth, masks=masks)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data, as written beside every result."""
+        return {
+            "camera": self.camera and camera_to_json(self.camera),
+            "depth": self.depth,
+            "depth_kind": self.depth_kind,
+            "masks": self.masks,
+            "preset": self.preset,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Video:
+    """A video file as it is now.
+
+    Attributes:
+        path: absolute.
+        name: of its folder in the output.
+        size, modified_ns: of the file, by which it is known again.
+    """
+
+    path: Path
+    name: str
+    size: int
+    modified_ns: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data."""
+        return {"video": str(self.path), "size": self.size, "modified_ns": self.modified_ns}
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One shot to reconstruct.
+
+    Attributes:
+        folder: of the result, absolute.
+    """
+
+    video: Video
+    frames: range
+    method: Method
+    folder: Path
+
+    def to_dict(self) -> dict[str, Any]:
+        """What the result depends on, as written beside it."""
+        frames = f"{self.frames.start}:{self.frames.stop}"
+        content: dict[str, Any] = json.loads(
+            json_text({**self.video.to_dict(), "frames": frames, **self.method.to_dict()})
+        )
+        return content
+
+    def is_done(self) -> bool:
+        """Whether the folder holds the result of this very job."""
+        try:
+            content = json.loads((self.folder / "summary.json").read_text(encoding="utf-8"))
+            return (self.folder / "report.html").is_file() and content["options"]["job"] == self.to_dict()
+        except (OSError, ValueError, LookupError, TypeError):
+            return False
+
+
+def find_videos(source: Path) -> list[Video]:
+    """The video file, or those of a folder in natural order.
+
+    Raises:
+        InputError: there is none.
+    """
+    if source.is_dir():
+        paths = list_files(source, VIDEO_SUFFIXES)
+        if not paths:
+            raise InputError(f"folder {source} holds no videos ({', '.join(s[1:] for s in VIDEO_SUFFIXES)})")
+    elif source.is_file():
+        paths = [source]
+    else:
+        raise InputError(f"{source} does not exist; a video file or a folder of videos is expected")
+    stems = Counter(path.stem.lower() for path in paths)
+    videos = []
+    for path in paths:
+        status = path.stat()
+        name = path.stem if stems[path.stem.lower()] == 1 else path.name
+        videos.append(Video(path.resolve(), name, status.st_size, status.st_mtime_ns))
+    return videos
+
+
+def shots_of(video: Video) -> list[range]:
+    """Its shots.
+
+    Raises:
+        InputError: the video cannot be read, or shows nothing.
+    """
+    shots = find_shots(video.path)
+    if not shots:
+        raise InputError(f"{video.path} holds no shot: all of its frames are blank")
+    return shots
+
+
+def plan_jobs(shots: Mapping[Video, Sequence[range]], method: Method, output: Path, *, several: bool) -> list[Job]:
+    """A job for every shot.
+
+    Args:
+        several: whether maps and masks are in folders with the names of the videos.
+
+    Raises:
+        InputError: masks are given, and none belongs to any frame.
+    """
+    jobs = []
+    matched = False
+    for video, ranges in shots.items():
+        own = method.of_video(video.name) if several else method
+        masks = MaskFolder(own.masks) if own.masks is not None and Path(own.masks).is_dir() else None
+        for number, frames in enumerate(ranges, 1):
+            # Of a film, often only the shots with actors have masks.
+            masked = masks is None or any(map(masks.has, frames))
+            matched |= own.masks is not None and masked
+            chosen = own if masked else replace(own, masks=None)
+            jobs.append(Job(video, frames, chosen, output.absolute() / video.name / f"shot_{number:03d}"))
+    if method.masks is not None and not matched:
+        raise InputError(f"no mask in {method.masks} matches a frame of a shot")
+    return jobs

@@ -1,0 +1,70 @@
+"""What a worker does with a job: the same as ``factorsfm reconstruct``, and the result or the failure on disk."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import cv2
+from threadpoolctl import threadpool_limits
+
+from factorsfm import api
+from factorsfm.batch.plan import Job, Video, shots_of
+from factorsfm.errors import FactorsfmError, ReconstructionError
+from factorsfm.export.folder import write_failure, write_folder
+
+Progress = Callable[[str, int, int | None], None]
+
+
+def find_shots_of(video: Video, *, one_thread: bool) -> list[range]:
+    """Shots of a video; errors as in `plan.shots_of`."""
+    with _threads(one_thread):
+        return shots_of(video)
+
+
+def reconstruct_shot(job: Job, *, one_thread: bool, progress: Progress | None = None) -> None:
+    """Write the result of a shot, or why there is none.
+
+    Args:
+        one_thread: keep to one thread, since other workers have the other cores.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    begin = time.perf_counter()
+    method = job.method
+    try:
+        with _threads(one_thread):
+            reconstruction = api.reconstruct(
+                job.video.path,
+                camera=method.camera,
+                depth=method.depth,
+                depth_kind=method.depth_kind,
+                masks=method.masks,
+                frames=slice(job.frames.start, job.frames.stop),
+                preset=method.preset,
+                progress=progress,
+            )
+    except FactorsfmError as error:
+        frames = error.frames if isinstance(error, ReconstructionError) else ()
+        options = {"source": str(job.video.path), "job": job.to_dict()}
+        write_failure(job.folder, str(error), frames, options, {"total": time.perf_counter() - begin})
+        return
+    reconstruction.options["job"] = job.to_dict()
+    write_folder(reconstruction, job.folder)
+
+
+@contextmanager
+def _threads(one: bool) -> Iterator[None]:
+    """Libraries with one thread each, or as they are."""
+    if not one:
+        yield
+        return
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)  # onnxruntime follows it, see `priors.networks`
+    try:
+        with threadpool_limits(1):
+            yield
+    finally:
+        cv2.setNumThreads(before)
