@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.factors import affine_inverse_depth, by_pose, cauchy, cross_matrices, reprojection
+from factorsfm.factors import affine_inverse_depth, by_pose, cauchy, cross_matrices, distort, reprojection
 from factorsfm.marginals import Marginals, tangent_basis
 from factorsfm.options import PolishOptions
 from factorsfm.problem import Observations, PriorObservations, State
@@ -70,6 +70,8 @@ class BundleAdjustment:
         sigma: standard deviation of an observation (pixels).
         free_translation: False estimates rotations and bearings alone.
         free_focal: whether the focal length is estimated.
+        lens_sigmas: (4,) standard deviations with which `State.lens` is known beforehand (0: exactly); None: it is
+            zero, the observations are undistorted.
         points_only: True holds everything but the points fixed.
         fixed: (k,) frames whose poses are held; by default the first, which is the world.
         prior: depth-prior values, or None.
@@ -84,6 +86,7 @@ class BundleAdjustment:
         sigma: float,
         free_translation: bool = True,
         free_focal: bool = False,
+        lens_sigmas: Array | None = None,
         points_only: bool = False,
         fixed: NDArray[np.bool_] | None = None,
         prior: PriorObservations | None = None,
@@ -97,19 +100,25 @@ class BundleAdjustment:
         self.prior = prior
         self.iterations = 0
         self._anchor = state.inverse_distance.copy()
-        self._pixels = observations.xy * np.exp(state.log_focal)  # what was measured, whatever the focal length
+        self._lens_sigmas = lens_sigmas
+        self._lens_anchor = state.lens
+        seen = observations.xy if lens_sigmas is None else distort(observations.xy, state.lens)[0]
+        self._pixels = seen * np.exp(state.log_focal)  # what was measured, whatever the lens
         frames, images, nodes = len(state.rotation), len(state.scale), len(state.field)
         self._lens = 6 * frames
-        self._affine = self._lens + 1
+        self._affine = self._lens + (1 if lens_sigmas is None else 5)
         self._field = self._affine + 2 * images
         self._columns = self._field + nodes
         free = np.ones(self._columns, bool)
         held = np.arange(frames) == 0 if fixed is None else fixed
         free[: self._lens] = np.repeat(~held, 6)
         free[self._lens] = free_focal
+        if lens_sigmas is not None:
+            free[self._lens + 1 : self._affine] = lens_sigmas > 0
         if not free_translation:
             free[: self._lens].reshape(-1, 6)[:, 3:] = False
         self._free = np.nonzero(free & (not points_only))[0]
+        self.free_lens = np.nonzero(free[self._lens : self._affine])[0]  # of log focal length and `State.lens`
         self._groups: list[list[tuple[Index, Index, Index]]] | None = None
         self._chunks: list[tuple[list[NDArray[np.intp]], Index, slice]] | None = None
 
@@ -132,13 +141,30 @@ class BundleAdjustment:
         return cauchy(self._reprojection(self.state)[0], self.options.kernel)[0]
 
     def _reprojection(self, state: State) -> tuple[Array, Array, Array]:
-        o = self.observations
+        o, focal = self.observations, np.exp(state.log_focal)
         q = state.camera_points(o.frame, o.point)
         behind = q[:, 2] <= 1e-6
         q[behind, 2] = 1e-6
-        residual, by_q = reprojection(q, self._pixels, np.exp(state.log_focal))
+        residual, by_q = reprojection(q, self._pixels, focal)
+        if self._lens_sigmas is not None:
+            uv, by_uv, _ = distort(q[:, :2] / q[:, 2:], state.lens)
+            residual, by_q = focal * uv - self._pixels, by_uv @ by_q
         by_q[behind] = 0.0
         return residual / self.sigma, by_q / self.sigma, q
+
+    def _by_lens(self, residual: Array, q: Array) -> Array:
+        """(m, 2, c) derivative of the residuals by the columns of the lens."""
+        by_focal = (residual + self._pixels / self.sigma)[:, :, None]  # d r / d log f is the prediction
+        if self._lens_sigmas is None:
+            return by_focal
+        by_lens = distort(q[:, :2] / q[:, 2:], self.state.lens)[2] * (np.exp(self.state.log_focal) / self.sigma)
+        return np.concatenate([by_focal, by_lens], 2)
+
+    def _lens_prior(self, state: State) -> tuple[Array, Array]:
+        """Differences to what is known of the lens, and the information; none of it where nothing is estimated."""
+        sigmas = np.zeros(4) if self._lens_sigmas is None else self._lens_sigmas
+        free = sigmas > 0
+        return np.where(free, state.lens - self._lens_anchor, 0.0), np.where(free, sigmas, np.inf) ** -2.0
 
     def prior_residuals(self, state: State | None = None) -> Array:
         """(m,) residuals of the prior (unit of its inverse depth)."""
@@ -158,6 +184,8 @@ class BundleAdjustment:
     def _cost(self, state: State) -> float:
         cost = cauchy(self._reprojection(state)[0], self.options.kernel)[0].sum()
         cost += 0.5 * (((state.inverse_distance - self._anchor) / self._point_sigma) ** 2).sum()
+        difference, information = self._lens_prior(state)
+        cost += 0.5 * (information * difference**2).sum()
         if (p := self.prior) is not None:
             cost += cauchy(self._prior(state)[0][:, None], self.options.kernel)[0].sum()
             cost += 0.5 * state.field @ p.field_information @ state.field
@@ -177,10 +205,11 @@ class BundleAdjustment:
         residual, by_q, q = self._reprojection(s)
         weight = np.sqrt(cauchy(residual, self.options.kernel)[1])
         gain = np.ascontiguousarray((by_q * weight[:, None, None]).transpose(1, 0, 2))
-        by_focal = gain[:, :, 0] * q[:, 0] + gain[:, :, 1] * q[:, 1]  # d r / d log f = f q_xy / q_z
-        by_camera = np.concatenate([by_pose(gain, q, s.inverse_distance[o.point]), by_focal[:, :, None]], 2)
+        by_lens = (self._by_lens(residual, q) * weight[:, None, None]).transpose(1, 0, 2)
+        by_camera = np.concatenate([by_pose(gain, q, s.inverse_distance[o.point]), by_lens], 2)
         by_point = gain.transpose(1, 0, 2) @ self._by_point(tangent, o.frame, o.point)
-        columns = np.concatenate([6 * o.frame[:, None] + np.arange(6), np.full((len(q), 1), self._lens)], 1)
+        lens = np.broadcast_to(np.arange(self._lens, self._affine), (len(q), self._affine - self._lens))
+        columns = np.concatenate([6 * o.frame[:, None] + np.arange(6), lens], 1)
         terms = [
             _Term(
                 (residual * weight[:, None]).T,
@@ -247,6 +276,11 @@ class BundleAdjustment:
                         point[seen, j, i] += sums
         point[:, 2, 2] += 1.0 / self._point_sigma**2
         point_gradient[:, 2] += (s.inverse_distance - self._anchor) / self._point_sigma**2
+        if self._lens_sigmas is not None:
+            lens = np.arange(self._lens + 1, self._affine)
+            difference, information = self._lens_prior(s)
+            camera[lens, lens] += information
+            gradient[lens] += information * difference
         if (p := self.prior) is not None:
             affine = np.arange(self._affine, self._field)
             information = np.tile([p.scale_sigma**-2.0, p.shift_sigma**-2.0], len(s.scale))
@@ -349,15 +383,23 @@ class BundleAdjustment:
         s = self.state
         pose = camera[: self._lens].reshape(-1, 6)
         turn = _exponential(-pose[:, :3])
-        bearing = s.bearing + np.einsum("nij,nj->ni", tangent_basis(s.bearing), point[:, :2])
+        by_lens = float(camera[self._lens])
+        # A new focal length moves the points along, so that the first camera sees them where it did: what the step
+        # says of that to first order is done in full.
+        stretch = np.array([np.exp(-by_lens), np.exp(-by_lens), 1.0])
+        tangent, side = tangent_basis(s.bearing), s.bearing * [1.0, 1.0, 0.0]
+        turned = point[:, :2] + by_lens * np.einsum("ni,nij->nj", side, tangent)
+        nearer = point[:, 2] - by_lens * s.inverse_distance * (side**2).sum(1)
+        bearing = (s.bearing + np.einsum("nij,nj->ni", tangent, turned)) * stretch
         length = np.linalg.norm(bearing, axis=1)
         affine = camera[self._affine : self._field].reshape(-1, 2)
         return State(
             rotation=turn @ s.rotation,
             translation=np.einsum("nij,nj->ni", turn, s.translation - pose[:, 3:]),
             bearing=bearing / length[:, None],
-            inverse_distance=(s.inverse_distance + point[:, 2]) / length,
-            log_focal=s.log_focal + float(camera[self._lens]),
+            inverse_distance=(s.inverse_distance + nearer) / length,
+            log_focal=s.log_focal + by_lens,
+            lens=s.lens if self._lens_sigmas is None else s.lens + camera[self._lens + 1 : self._affine],
             scale=s.scale + affine[:, 0],
             shift=s.shift + affine[:, 1],
             field=s.field + camera[self._field :],
@@ -421,6 +463,27 @@ class BundleAdjustment:
         camera = np.zeros((self._columns, self._columns))
         camera[np.ix_(free, free)] = np.linalg.inv(_conditioned(information[np.ix_(free, free)]))
         return Marginals(camera, given_camera, blocks)
+
+    def influences(self, columns: Index) -> Array:
+        """(n, p) by how much the residuals of each point alone move some columns of the camera side.
+
+        At the minimum they cancel; their squares tell how uncertain the columns are, whatever the noise really is.
+        """
+        normal = self._linearize()
+        blocks = self._cross_blocks(normal)
+        information, _, given_camera = self._reduced(normal, blocks, 0.0)
+        free = self._free
+        gain = np.zeros((self._columns, len(columns)))
+        gain[free] = np.linalg.inv(_conditioned(information[np.ix_(free, free)]))[:, np.searchsorted(free, columns)]
+        moved = np.zeros((len(self.state.bearing), len(columns)))
+        for t in normal.terms:
+            by_camera = np.einsum("cdm,dm->mc", t.by_camera, t.residual)
+            np.add.at(moved, t.point, np.einsum("mc,mcp->mp", by_camera, gain[t.columns]))
+        step = np.einsum("nij,nj->ni", given_camera, normal.point_gradient)
+        for cross, used, span in blocks:
+            pull = cross.reshape(len(used), -1, 3)
+            moved[span] -= np.einsum("cni,ni,cp->np", pull, step[span], gain[used], optimize=True)
+        return -moved
 
 
 def _conditioned(information: Array) -> Array:
