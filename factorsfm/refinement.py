@@ -9,11 +9,11 @@ distance, in which small motion is almost linear.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.elimination import Block, Elimination, Normal, Term, conditioned, reduced
 from factorsfm.factors import affine_inverse_depth, by_pose, cauchy, cross_matrices, distort, reprojection
 from factorsfm.marginals import Marginals, tangent_basis
 from factorsfm.options import PolishOptions
@@ -25,37 +25,8 @@ Index = NDArray[np.int64]
 # The camera side's step at a state, from its information matrix and gradient with the points eliminated.
 CameraSolver = Callable[[State, Array, Array], Array]
 
-_CHUNK = 512  # points eliminated together
 _FIRST_DAMPING = 1e-4
 _LARGEST_DAMPING = 1e6
-
-
-@dataclass(frozen=True, slots=True)
-class _Term:
-    """Linearised residuals, the observations along the last axis (contiguous, so that numpy runs at full speed).
-
-    Attributes:
-        residual: (d, m); by_camera: (c, d, m); by_point: (3, d, m).
-        columns: (m, c) camera-side variables of `by_camera`; frame, point: (m,).
-    """
-
-    residual: Array
-    by_camera: Array
-    columns: Index
-    by_point: Array
-    frame: Index
-    point: Index
-
-
-@dataclass(slots=True)
-class _Normal:
-    """Normal equations before the points are eliminated."""
-
-    camera: Array  # (c, c)
-    camera_gradient: Array  # (c,)
-    point: Array  # (n, 3, 3)
-    point_gradient: Array  # (n, 3)
-    terms: list[_Term]
 
 
 def _newton_step(state: State, information: Array, gradient: Array) -> Array:
@@ -119,8 +90,7 @@ class BundleAdjustment:
             free[: self._lens].reshape(-1, 6)[:, 3:] = False
         self._free = np.nonzero(free & (not points_only))[0]
         self.free_lens = np.nonzero(free[self._lens : self._affine])[0]  # of log focal length and `State.lens`
-        self._groups: list[list[tuple[Index, Index, Index]]] | None = None
-        self._chunks: list[tuple[list[NDArray[np.intp]], Index, slice]] | None = None
+        self._elimination = Elimination(self._columns, len(state.bearing))
 
     # --- residuals ----------------------------------------------------------------------------------------------
 
@@ -156,7 +126,7 @@ class BundleAdjustment:
         """(m, 2, c) derivative of the residuals by the columns of the lens."""
         by_focal = (residual + self._pixels / self.sigma)[:, :, None]  # d r / d log f is the prediction
         if self._lens_sigmas is None:
-            return by_focal
+            return np.asarray(by_focal)
         by_lens = distort(q[:, :2] / q[:, 2:], self.state.lens)[2] * (np.exp(self.state.log_focal) / self.sigma)
         return np.concatenate([by_focal, by_lens], 2)
 
@@ -199,7 +169,7 @@ class BundleAdjustment:
 
     # --- linearisation ------------------------------------------------------------------------------------------
 
-    def _terms(self) -> list[_Term]:
+    def _terms(self) -> list[Term]:
         s, o = self.state, self.observations
         tangent = tangent_basis(s.bearing)
         residual, by_q, q = self._reprojection(s)
@@ -211,7 +181,7 @@ class BundleAdjustment:
         lens = np.broadcast_to(np.arange(self._lens, self._affine), (len(q), self._affine - self._lens))
         columns = np.concatenate([6 * o.frame[:, None] + np.arange(6), lens], 1)
         terms = [
-            _Term(
+            Term(
                 (residual * weight[:, None]).T,
                 np.ascontiguousarray(by_camera.transpose(2, 0, 1)),
                 columns,
@@ -234,7 +204,7 @@ class BundleAdjustment:
             affine = self._affine + 2 * p.image[:, None] + np.arange(2)
             columns = np.concatenate([6 * p.frame[:, None] + np.arange(6), affine, self._field + p.nodes], 1)
             terms.append(
-                _Term(
+                Term(
                     (value * weight)[None],
                     np.ascontiguousarray(by_camera.T)[:, None],
                     columns,
@@ -250,30 +220,12 @@ class BundleAdjustment:
         by_bearing = self.state.rotation[frame] @ tangent[point]
         return np.concatenate([by_bearing, self.state.translation[frame][:, :, None]], 2)
 
-    def _linearize(self) -> _Normal:
-        s, c, n = self.state, self._columns, len(self.state.bearing)
-        terms = self._terms()
-        camera, gradient = np.zeros((c, c)), np.zeros(c)
-        point, point_gradient = np.zeros((n, 3, 3)), np.zeros((n, 3))
-        for t, groups in zip(terms, self._frame_groups(terms), strict=True):
-            for rows, columns, local in groups:
-                entries = t.by_camera[:, :, rows]
-                dense = np.zeros((len(columns), *entries.shape[1:]))
-                if local.shape[0] == 1:
-                    dense[local[0]] = entries
-                else:
-                    np.put_along_axis(dense, np.broadcast_to(local.T[:, None], entries.shape), entries, 0)
-                dense = dense.reshape(len(columns), -1)
-                camera[np.ix_(columns, columns)] += dense @ dense.T
-                gradient[columns] += dense @ t.residual[:, rows].ravel()
-            seen, first = np.unique(t.point, return_index=True)
-            for i in range(3):
-                point_gradient[seen, i] += np.add.reduceat((t.by_point[i] * t.residual).sum(0), first)
-                for j in range(i, 3):
-                    sums = np.add.reduceat((t.by_point[i] * t.by_point[j]).sum(0), first)
-                    point[seen, i, j] += sums
-                    if j > i:
-                        point[seen, j, i] += sums
+    def _linearize(self) -> Normal:
+        s = self.state
+        normal = self._elimination.normal_equations(self._terms())
+        camera, gradient, point, point_gradient = (
+            normal.camera, normal.camera_gradient, normal.point, normal.point_gradient
+        )  # fmt: skip
         point[:, 2, 2] += 1.0 / self._point_sigma**2
         point_gradient[:, 2] += (s.inverse_distance - self._anchor) / self._point_sigma**2
         if self._lens_sigmas is not None:
@@ -288,91 +240,23 @@ class BundleAdjustment:
             gradient[affine] += information * np.stack([s.scale - 1.0, s.shift], -1).ravel()
             camera[self._field :, self._field :] += p.field_information
             gradient[self._field :] += p.field_information @ s.field
-        return _Normal(camera, gradient, point, point_gradient, terms)
-
-    def _frame_groups(self, terms: list[_Term]) -> list[list[tuple[Index, Index, Index]]]:
-        """For every term and frame: its rows, their columns, and the position of each entry among the columns.
-
-        The positions have a single row where they are the same for all rows of the frame.
-        """
-        if self._groups is None:
-            self._groups = []
-            for t in terms:
-                order = np.argsort(t.frame, kind="stable")
-                groups = []
-                for rows in np.split(order, np.nonzero(np.diff(t.frame[order]))[0] + 1):
-                    columns, local = np.unique(t.columns[rows], return_inverse=True)
-                    local = local.reshape(len(rows), -1)
-                    groups.append((rows, columns, local[:1] if (local == local[:1]).all() else local))
-                self._groups.append(groups)
-        return self._groups
-
-    def _chunk_indices(self, terms: list[_Term]) -> list[tuple[list[NDArray[np.intp]], Index, slice]]:
-        """For every chunk of points: flat positions of the cross blocks of each term, the columns, the points."""
-        if self._chunks is None:
-            self._chunks = []
-            n = len(self.state.bearing)
-            for begin in range(0, n, _CHUNK):
-                end = min(n, begin + _CHUNK)
-                rows = [slice(*np.searchsorted(t.point, [begin, end])) for t in terms]
-                columns = np.unique(np.concatenate([t.columns[r].ravel() for t, r in zip(terms, rows, strict=True)]))
-                flat = []
-                for t, r in zip(terms, rows, strict=True):
-                    local = np.searchsorted(columns, t.columns[r])
-                    position = local.T[:, None] * 3 * (end - begin) + 3 * (t.point[r] - begin)
-                    flat.append((position + np.arange(3)[:, None]).ravel())
-                self._chunks.append((flat, columns, slice(begin, end)))
-        return self._chunks
-
-    def _cross_blocks(self, normal: _Normal) -> list[tuple[Array, Index, slice]]:
-        """Camera-point blocks of the information matrix, dense over the columns of each chunk."""
-        blocks = []
-        for flat, columns, span in self._chunk_indices(normal.terms):
-            n = span.stop - span.start
-            cross = np.zeros(len(columns) * 3 * n)
-            for t, position in zip(normal.terms, flat, strict=True):
-                rows = slice(*np.searchsorted(t.point, [span.start, span.stop]))
-                a, b = t.by_camera[:, :, rows], t.by_point[:, :, rows]
-                values = sum(a[:, None, d] * b[None, :, d] for d in range(a.shape[1]))
-                cross += np.bincount(position, np.ravel(values), len(cross))
-            blocks.append((cross.reshape(len(columns), 3 * n), columns, span))
-        return blocks
+        return normal
 
     # --- solving ------------------------------------------------------------------------------------------------
-
-    def _reduced(
-        self, normal: _Normal, blocks: list[tuple[Array, Index, slice]], damping: float
-    ) -> tuple[Array, Array, Array]:
-        """Information and gradient of the camera side with the points eliminated, and the points' covariance."""
-        point = normal.point.copy()
-        diagonal = np.einsum("nii->ni", point)
-        diagonal += damping * diagonal + 1e-12
-        point_covariance = np.asarray(np.linalg.inv(point), np.float64)
-        root = np.linalg.cholesky(point_covariance)
-        information = normal.camera.copy()
-        information[np.diag_indices_from(information)] *= 1.0 + damping
-        gradient = normal.camera_gradient.copy()
-        for cross, columns, span in blocks:
-            n = span.stop - span.start
-            half = (cross.reshape(-1, n, 3).transpose(1, 0, 2) @ root[span]).transpose(1, 0, 2).reshape(-1, 3 * n)
-            information[np.ix_(columns, columns)] -= half @ half.T
-            step = np.einsum("nij,nj->ni", point_covariance[span], normal.point_gradient[span])
-            gradient[columns] -= cross @ step.ravel()
-        return information, gradient, point_covariance
 
     def condensed(self) -> tuple[Array, Array]:
         """Information matrix and gradient of the free camera side at the present state, the points eliminated."""
         normal = self._linearize()
-        information, gradient, _ = self._reduced(normal, self._cross_blocks(normal), 0.0)
-        return _conditioned(information[np.ix_(self._free, self._free)]), gradient[self._free]
+        information, gradient, _ = reduced(normal, self._elimination.cross_blocks(normal), 0.0)
+        return conditioned(information[np.ix_(self._free, self._free)]), gradient[self._free]
 
     def _step(
-        self, normal: _Normal, blocks: list[tuple[Array, Index, slice]], damping: float, solve_cameras: CameraSolver
+        self, normal: Normal, blocks: list[Block], damping: float, solve_cameras: CameraSolver
     ) -> tuple[Array, Array]:
-        information, gradient, point_covariance = self._reduced(normal, blocks, damping)
+        information, gradient, point_covariance = reduced(normal, blocks, damping)
         free = self._free
         camera = np.zeros(self._columns)
-        camera[free] = solve_cameras(self.state, _conditioned(information[np.ix_(free, free)]), gradient[free])
+        camera[free] = solve_cameras(self.state, conditioned(information[np.ix_(free, free)]), gradient[free])
         point = np.empty((len(self.state.bearing), 3))
         for cross, columns, span in blocks:
             pull = normal.point_gradient[span] + (camera[columns] @ cross).reshape(-1, 3)
@@ -416,7 +300,7 @@ class BundleAdjustment:
         cost = self.cost()
         for _ in range(iterations or self.options.iterations):
             normal = self._linearize()
-            blocks = self._cross_blocks(normal)
+            blocks = self._elimination.cross_blocks(normal)
             while damping < _LARGEST_DAMPING:
                 candidate = self._retract(*self._step(normal, blocks, damping, solve_cameras))
                 new_cost = self._cost(candidate)
@@ -457,11 +341,11 @@ class BundleAdjustment:
     def marginals(self) -> Marginals:
         """Everything that covariances are made of, at the present state."""
         normal = self._linearize()
-        blocks = self._cross_blocks(normal)
-        information, _, given_camera = self._reduced(normal, blocks, 0.0)
+        blocks = self._elimination.cross_blocks(normal)
+        information, _, given_camera = reduced(normal, blocks, 0.0)
         free = self._free
         camera = np.zeros((self._columns, self._columns))
-        camera[np.ix_(free, free)] = np.linalg.inv(_conditioned(information[np.ix_(free, free)]))
+        camera[np.ix_(free, free)] = np.linalg.inv(conditioned(information[np.ix_(free, free)]))
         return Marginals(camera, given_camera, blocks)
 
     def influences(self, columns: Index) -> Array:
@@ -470,11 +354,11 @@ class BundleAdjustment:
         At the minimum they cancel; their squares tell how uncertain the columns are, whatever the noise really is.
         """
         normal = self._linearize()
-        blocks = self._cross_blocks(normal)
-        information, _, given_camera = self._reduced(normal, blocks, 0.0)
+        blocks = self._elimination.cross_blocks(normal)
+        information, _, given_camera = reduced(normal, blocks, 0.0)
         free = self._free
         gain = np.zeros((self._columns, len(columns)))
-        gain[free] = np.linalg.inv(_conditioned(information[np.ix_(free, free)]))[:, np.searchsorted(free, columns)]
+        gain[free] = np.linalg.inv(conditioned(information[np.ix_(free, free)]))[:, np.searchsorted(free, columns)]
         moved = np.zeros((len(self.state.bearing), len(columns)))
         for t in normal.terms:
             by_camera = np.einsum("cdm,dm->mc", t.by_camera, t.residual)
@@ -484,11 +368,6 @@ class BundleAdjustment:
             pull = cross.reshape(len(used), -1, 3)
             moved[span] -= np.einsum("cni,ni,cp->np", pull, step[span], gain[used], optimize=True)
         return -moved
-
-
-def _conditioned(information: Array) -> Array:
-    """The matrix with a ridge far below any information that matters."""
-    return np.asarray(information + np.diag(1e-12 * np.maximum(information.diagonal(), 1e-300)))
 
 
 def _exponential(rotation_vector: Array) -> Array:
