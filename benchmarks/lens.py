@@ -83,8 +83,8 @@ def main() -> None:
         print(rows[-1], flush=True)
     text = [
         "# Unknown lenses", "",
-        f"`python -m benchmarks.lens --data FOLDER --models FOLDER --shots {' '.join(arguments.shots)}`; prior: TCMonoDepth.",
-        "AUC: of the relative poses at 1 / 5 degrees. Standard deviations in percent of the focal length.", "",
+        f"`python -m benchmarks.lens --data FOLDER --models FOLDER --shots {' '.join(arguments.shots)}`", "",
+        "Prior: TCMonoDepth. AUC: of the relative poses at 1 / 5 degrees. std: of the focal length.", "",
         "| shot | parallax | true f | estimate | error % | std % | determined | AUC, lens known | AUC, unknown | s |",
         "|---|---|---|---|---|---|---|---|---|---|", *rows, "",
     ]  # fmt: skip
