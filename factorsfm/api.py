@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pycolmap
@@ -17,7 +18,7 @@ from factorsfm.camera import guess_camera
 from factorsfm.errors import InputError
 from factorsfm.frames import Frame, read_frames
 from factorsfm.image_set import ImageSet
-from factorsfm.options import Options
+from factorsfm.options import LensFreedom, Options
 from factorsfm.priors.depth import DepthFolder, DepthKind, DepthPrior, open_depth
 from factorsfm.priors.masks import MaskFolder, MaskPrior, open_masks
 from factorsfm.reconstruction import Reconstruction
@@ -36,6 +37,7 @@ def reconstruct(
     masks: str | Path | MaskPrior | None = None,
     frames: slice | None = None,
     preset: str = "default",
+    lens: LensFreedom = "auto",
     unordered: bool | None = None,
     work: str | Path | None = None,
     progress: Progress | None = None,
@@ -44,12 +46,13 @@ def reconstruct(
 
     Args:
         source: a video file, a folder of images, or any iterable of 8-bit images (BGR or grey) or `Frame`s.
-        camera: the lens; None takes EXIF or a guess and refines the focal length where the shot determines it.
+        camera: the lens; None takes EXIF or a guess.
         depth: a network (ONNX file), a named model, a folder of maps, any `DepthPrior`, or None.
         depth_kind: what the prior holds, where it cannot be known.
         masks: a folder, a segmentation network, any `MaskPrior`, or None.
         frames: range of the source's frames.
         preset: see `options.PRESETS`.
+        lens: what of the lens is estimated where the shot determines it, see `Options`.
         unordered: whether the images are a set in any order, which are matched with each other, or a shot, which is
             tracked from frame to frame; None decides for folders by `unordered.looks_unordered`.
         work: folder for the features and matches of a set, from which an interrupted run goes on; None keeps nothing.
@@ -60,7 +63,9 @@ def reconstruct(
         ReconstructionError: the shot cannot be reconstructed.
     """
     begin = time.perf_counter()
-    options = Options.preset_named(preset)
+    if lens not in get_args(LensFreedom):
+        raise InputError(f"unknown lens '{lens}', expected one of {', '.join(get_args(LensFreedom))}")
+    options = replace(Options.preset_named(preset), lens=lens)
     prior = open_depth(depth, depth_kind) if options.uses_depth else None
     mask_prior = open_masks(masks)
     if unordered is None:
@@ -86,7 +91,7 @@ def _from_shot(
 ) -> Reconstruction:
     iterator = read_frames(source, frames)
     if camera is None:
-        options = replace(options, refine_focal_length=True)
+        options = options.for_unknown_lens()
     stream: Stream | None = None
     for done, frame in enumerate(iterator):
         if stream is None:

@@ -26,6 +26,9 @@ PIXEL_CENTER = 0.5  # of pycolmap's pixels; subtract it to get OpenCV's
 # lenses (18 to 50 mm on Super 35, 69 to 28 degrees), so that the guess is wrong by a factor of two at most.
 GUESSED_FIELD_OF_VIEW = math.radians(50)
 
+_RADIAL_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+_RADIAL_NAMES = ("f", "fx", "fy", "cx", "cy", "k", "k1", "k2")
+
 
 def read_camera(path: str | Path) -> pycolmap.Camera:
     """Read a camera from a JSON file.
@@ -130,6 +133,43 @@ def with_focal(camera: pycolmap.Camera, focal: float) -> pycolmap.Camera:
         params[index] *= ratio
         estimated.params = params
     return estimated
+
+
+def lens_shape(camera: pycolmap.Camera) -> NDArray[np.float64]:
+    """(4,) distortion of a camera as in `factors.distort`, from which an estimate of it starts.
+
+    Raises:
+        InputError: its model has more to it than radial distortion.
+    """
+    names = [name.strip() for name in camera.params_info.split(",")]
+    values = dict(zip(names, camera.params, strict=True))
+    more = [name for name in names if name not in _RADIAL_NAMES and values[name] != 0]
+    if more or camera.model_name not in _RADIAL_MODELS:
+        raise InputError(
+            f"a lens of the model {camera.model_name} was to be estimated{' with ' + more[0] if more else ''}; "
+            f"one of {', '.join(_RADIAL_MODELS)} without tangential distortion is expected"
+        )
+    return np.array([values.get("k1", values.get("k", 0.0)), values.get("k2", 0.0), 0.0, 0.0])
+
+
+def with_lens(camera: pycolmap.Camera, focal: float, shape: NDArray[np.float64]) -> pycolmap.Camera:
+    """The same camera with another mean focal length (pixels) and (4,) distortion as in `factors.distort`.
+
+    RADIAL, or OPENCV where the pixels are not square.
+    """
+    scaled = with_focal(camera, focal)
+    fx, fy = scaled.focal_length_x, scaled.focal_length_y
+    center = [scaled.principal_point_x + fx * shape[2], scaled.principal_point_y + fy * shape[3]]
+    k = shape[:2].tolist()
+    params = [fx, *center, *k] if fx == fy else [fx, fy, *center, *k, 0.0, 0.0]
+    return pycolmap.Camera(
+        camera_id=camera.camera_id,
+        model="RADIAL" if fx == fy else "OPENCV",
+        width=camera.width,
+        height=camera.height,
+        params=params,
+        has_prior_focal_length=camera.has_prior_focal_length,
+    )
 
 
 def camera_from_json(content: Mapping[str, Any]) -> pycolmap.Camera:

@@ -10,7 +10,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NoReturn, TextIO
+from typing import Any, NoReturn, TextIO, get_args
 
 from factorsfm import api, demo, stream_command
 from factorsfm.batch import command as batch_command
@@ -19,7 +19,7 @@ from factorsfm.errors import FactorsfmError, ReconstructionError
 from factorsfm.export import command as export_command
 from factorsfm.export.folder import check_directory, write_failure, write_folder
 from factorsfm.frames import parse_range
-from factorsfm.options import PRESETS
+from factorsfm.options import PRESETS, LensFreedom
 from factorsfm.priors.depth import DepthKind
 from factorsfm.report import command as overlay_command
 from factorsfm.stream_command import unless_none
@@ -81,6 +81,7 @@ def _reconstruct(arguments: argparse.Namespace, progress: _Progress) -> None:
             masks=unless_none(arguments.masks),
             frames=frames,
             preset=arguments.preset,
+            lens=arguments.lens,
             unordered=arguments.unordered or None,
             work=arguments.work,
             progress=progress,
@@ -281,6 +282,13 @@ def _add_shot_arguments(parser: argparse.ArgumentParser, output: str = _RESULT) 
         "--masks",
         metavar="FOLDER|MODEL.onnx|none",
         help="what moves and is to be ignored: non-zero in the masks (default: none)",
+    )
+    parser.add_argument(
+        "--lens",
+        choices=get_args(LensFreedom),
+        default="auto",
+        help="what of the lens is estimated where the shot determines it: nothing, the focal length, also the radial "
+        "distortion, or also the principal point; auto: fixed with --camera, distortion without",
     )
     parser.add_argument("--preset", choices=list(PRESETS), default="default", help="default: %(default)s")
 

@@ -72,6 +72,27 @@ def reprojection(q: Array, observed: Array, focal: float) -> tuple[Array, Array]
     return focal * projected - observed, by_q
 
 
+def distort(uv: Array, lens: Array) -> tuple[Array, Array, Array]:
+    """``u (1 + k1 r^2 + k2 r^4) + c``: radial distortion as COLMAP's RADIAL model has it, and a principal point.
+
+    Args:
+        uv: (n, 2) undistorted normalised image coordinates.
+        lens: (4,) k1, k2, and the principal point's displacement in focal lengths.
+
+    Returns:
+        (n, 2) distorted coordinates, their derivative by `uv` (n, 2, 2) and by `lens` (n, 2, 4).
+    """
+    k1, k2 = lens[:2]
+    square = np.einsum("ni,ni->n", uv, uv)[:, None]
+    gain = 1.0 + square * (k1 + square * k2)
+    by_uv = np.einsum("ni,nj->nij", uv * (2.0 * k1 + 4.0 * k2 * square), uv)
+    by_uv[:, [0, 1], [0, 1]] += gain
+    by_lens = np.zeros((len(uv), 2, 4))
+    by_lens[:, :, 0], by_lens[:, :, 1] = uv * square, uv * square**2
+    by_lens[:, [0, 1], [2, 3]] = 1.0
+    return uv * gain + lens[2:], by_uv, by_lens
+
+
 def affine_inverse_depth(
     q: Array, w: Array, scale: Array | float, shift: Array | float, measured: Array
 ) -> tuple[Array, Array, Array]:

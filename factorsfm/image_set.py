@@ -16,7 +16,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.camera import PIXEL_CENTER, guess_camera
+from factorsfm.camera import PIXEL_CENTER, guess_camera, lens_shape
 from factorsfm.errors import InputError, ReconstructionError
 from factorsfm.frames import Frame, bgr_image
 from factorsfm.images import ImageTracks, MappedImage
@@ -90,7 +90,7 @@ class ImageSet:
         self.camera = camera
         options = options or Options()
         if camera is None:
-            options = replace(options, refine_focal_length=True)
+            options = options.for_unknown_lens()
         self.options = _for_image_sets(options)
         self.photos: list[Photo] = []
         self.seconds: dict[str, float] = defaultdict(float)
@@ -180,7 +180,12 @@ class ImageSet:
             )
         with self._timed("polish"), OneThreadEach():
             polished = polish(
-                mapper.images, mapper.points.all(), mapper.focal, self.options, lambda stage: report(stage, 0, None)
+                mapper.images,
+                mapper.points.all(),
+                mapper.focal,
+                self.options,
+                lambda stage: report(stage, 0, None),
+                lens_shape(camera) if self.options.refine_focal_length else None,
             )
         result = assemble(
             polished,
@@ -191,7 +196,6 @@ class ImageSet:
             camera,
             prior_given=self._depth is not None,
             metric=self._depth is not None and self._depth.kind is DepthKind.METRIC,
-            focal_guessed=self.options.refine_focal_length,
             seconds=dict(self.seconds),
             options=self.options.to_dict(),
         )

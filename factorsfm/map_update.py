@@ -37,7 +37,7 @@ _LARGEST_SIGMA_PX = 3.0
 _ALIKE = 20.0  # tracks that count as one: the errors of neighbours are alike
 _LENS_KEYFRAMES = 6  # from which an unknown focal length is estimated
 _LENS_ITERATIONS = 6
-_LENS_STD = 0.03  # relative, with which an estimate is better than a guess
+_LENS_STD = 0.01  # relative, with which an estimate is better than a guess; a young map can be wrong as a whole
 _LARGEST_LENS_STEP = 0.5  # of the logarithm of the focal length
 _FARTHEST = 1e-6  # smallest inverse distance of a point
 

@@ -20,6 +20,11 @@ def typical_sigma(errors: Array) -> float:
     return float(np.median(errors)) / _RAYLEIGH_MEDIAN
 
 
+def coordinate_sigma(errors: Array) -> float:
+    """`typical_sigma`, but no better than tracks can be."""
+    return max(typical_sigma(errors), SMALLEST_SIGMA_PX)
+
+
 def temporal_inflation(residual: Array, observations: Observations) -> float:
     """By how much the errors of a track in neighbouring frames repeat each other, as a factor on the variance.
 

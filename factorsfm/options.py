@@ -8,10 +8,9 @@ from typing import Any, Literal
 
 from factorsfm.errors import InputError
 
-# Relative standard deviation up to which a focal length counts as determined. It knows nothing of systematic tracking
-# errors: on a dolly without rotation, 0.9 % stood beside an error of 12 %.
-FOCAL_STD = 0.005
+FOCAL_STD = 0.015  # relative standard deviation up to which a focal length counts as determined
 
+LensFreedom = Literal["auto", "fixed", "focal", "distortion", "all"]
 DepthUse = Literal["none", "paper", "inverse"]
 
 
@@ -121,11 +120,12 @@ class Options:
 
     Attributes:
         preset: name from which the options were made.
-        refine_focal_length: whether the polish estimates the focal length (for a guessed lens).
+        lens: what the polish estimates where the shot determines it: nothing, the focal length, also the radial
+            distortion, or also the principal point; "auto" is "fixed" for a given camera and "distortion" for none.
     """
 
     preset: str = "default"
-    refine_focal_length: bool = False
+    lens: LensFreedom = "auto"
     tracker: TrackerOptions = field(default_factory=TrackerOptions)
     mapper: MapperOptions = field(default_factory=MapperOptions)
     polish: PolishOptions = field(default_factory=PolishOptions)
@@ -157,6 +157,15 @@ class Options:
             return cls(**{key: parts[key](**value) if key in parts else value for key, value in values.items()})
         except TypeError as error:
             raise InputError(f"these are not the options of this version: {error}") from error
+
+    @property
+    def refine_focal_length(self) -> bool:
+        """Whether the lens is an unknown of the polish."""
+        return self.lens not in ("auto", "fixed")
+
+    def for_unknown_lens(self) -> Options:
+        """What "auto" means without a camera."""
+        return replace(self, lens="distortion") if self.lens == "auto" else self
 
     @property
     def uses_depth(self) -> bool:

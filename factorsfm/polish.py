@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.images import MappedImage, gather
+from factorsfm.lens import Lens, LensEstimate, estimate_lens, through
 from factorsfm.marginals import in_scene_unit
-from factorsfm.noise import SMALLEST_SIGMA_PX, block_inflation, temporal_inflation, typical_sigma
+from factorsfm.noise import SMALLEST_SIGMA_PX, block_inflation, coordinate_sigma, temporal_inflation
 from factorsfm.observability import Motion, camera_observability, classify_motion, pose_blocks
-from factorsfm.options import FOCAL_STD, Options, PolishOptions
+from factorsfm.options import Options, PolishOptions
 from factorsfm.prior_term import PriorPart, joint_problem, weigh_prior
 from factorsfm.problem import Observations, State
 from factorsfm.reconstruction import CameraObservability, ShotKind
@@ -43,7 +44,7 @@ class Polished:
         covariance: (k, 6, 6) of the poses, GTSAM's convention, `in_scene_unit`.
         observability: what carries each of them.
         point_std: (n,) standard deviations of the inverse distances, in the same unit.
-        focal_std: relative standard deviation of the focal length, None where it was not estimated.
+        lens: what became of an unknown lens, None where it is known.
     """
 
     frames: list[int]
@@ -57,7 +58,7 @@ class Polished:
     observability: list[CameraObservability]
     point_std: Array
     prior: PriorPart | None = None
-    focal_std: float | None = None
+    lens: LensEstimate | None = None
 
 
 def polish(
@@ -66,12 +67,14 @@ def polish(
     focal: float,
     options: Options,
     progress: Callable[[str], None] = lambda stage: None,
+    shape: Array | None = None,
 ) -> Polished:
     """Triangulate all tracks and minimise over all registered frames.
 
     Args:
         images: at least one registered; map_points: track ids and positions of the incremental map.
         focal: pixels, a first guess where the options refine it.
+        shape: (4,) distortion of the lens as in `factors.distort` where the options refine the lens; None is none.
     """
     o = options.polish
     registered = [i for i, image in enumerate(images) if image.registered]
@@ -82,12 +85,11 @@ def polish(
 
     progress("polish: cameras")
     core, few, adjustment = _converge_cameras(state, observations, options)
-    focal_std = None
+    lens = None
     if options.refine_focal_length:
-        adjustment, focal_std = _checked_focal(adjustment, few, o, focal)
-        # The pixels were normalised with the guess.
-        ratio = focal / float(np.exp(adjustment.state.log_focal))
-        few, observations = (replace(part, xy=part.xy * ratio) for part in (few, observations))
+        adjustment, lens = estimate_lens(adjustment, Lens(focal, np.zeros(4) if shape is None else shape), options)
+        few, observations = adjustment.observations, lens.renormalize(observations)
+        state = through(state, lens.lens.focal)
     motion = classify_motion(adjustment, few, o)
     inflation = block_inflation(adjustment.reprojection_vectors(), few)
     weighed = None
@@ -131,11 +133,11 @@ def polish(
     result = Polished(
         frames, adjustment.state, tracks, observations, adjustment.reprojection_errors(), sigma,
         motion, pose_blocks(camera_covariance, k), observability,
-        marginals.inverse_distance_std(camera_covariance), prior, focal_std,
+        marginals.inverse_distance_std(camera_covariance), prior, lens,
     )  # fmt: skip
     if len(frames) < len(registered):
         progress("polish: frames between")
-        _add_frames_between(result, images, registered, focal, options)
+        _add_frames_between(result, images, registered, options)
     return result
 
 
@@ -218,10 +220,6 @@ def _core(observations: Observations, frames: int, count: int) -> Index:
 # --- stages -----------------------------------------------------------------------------------------------------
 
 
-def _noise(errors: Array) -> float:
-    return max(typical_sigma(errors), SMALLEST_SIGMA_PX)
-
-
 def _converge_cameras(
     state: State, observations: Observations, options: Options
 ) -> tuple[Index, Observations, BundleAdjustment]:
@@ -256,14 +254,14 @@ def _solve_core(part: State, few: Observations, options: Options) -> BundleAdjus
     """Converged from one start, first with a wide kernel."""
     o = options.polish
     errors = BundleAdjustment(part, few, o, sigma=1.0).reprojection_errors()
-    sigma = max(_FIRST_SIGMA_PX, _noise(errors))
+    sigma = max(_FIRST_SIGMA_PX, coordinate_sigma(errors))
     adjustment = BundleAdjustment(part, few, replace(o, iterations=20, tolerance=1e-3), sigma=sigma)
     adjustment.solve()
-    sigma = min(sigma, _noise(adjustment.reprojection_errors()))
-    adjustment = BundleAdjustment(adjustment.state, few, o, sigma=sigma, free_focal=options.refine_focal_length)
+    sigma = min(sigma, coordinate_sigma(adjustment.reprojection_errors()))
+    adjustment = BundleAdjustment(adjustment.state, few, o, sigma=sigma)
     adjustment.solve()
     logger.debug("cameras: %d iterations, %.3f px", adjustment.iterations, sigma)
-    adjustment.sigma = _noise(adjustment.reprojection_errors())
+    adjustment.sigma = coordinate_sigma(adjustment.reprojection_errors())
     return adjustment
 
 
@@ -319,21 +317,6 @@ def _without_outlying_observations(
     return _subset(Observations(o.frame[good], o.point[good], o.xy[good]), keep), tracks[keep], state
 
 
-def _checked_focal(
-    adjustment: BundleAdjustment, observations: Observations, options: PolishOptions, guess: float
-) -> tuple[BundleAdjustment, float]:
-    """The estimated focal length where the shot determines it, else the guess."""
-    covariance, _ = adjustment.covariance(np.zeros(0, np.int64))
-    column = 6 * len(adjustment.state.rotation)
-    inflation = temporal_inflation(adjustment.reprojection_vectors(), observations)
-    std = float(np.sqrt(covariance[column, column] * inflation))
-    if std > FOCAL_STD or not 0.3 < float(np.exp(adjustment.state.log_focal)) / guess < 3.0:
-        scaled = replace(adjustment.state, log_focal=float(np.log(guess)))
-        adjustment = BundleAdjustment(scaled, observations, options, sigma=adjustment.sigma)
-        adjustment.solve()
-    return adjustment, std
-
-
 # --- long shots -------------------------------------------------------------------------------------------------
 
 
@@ -349,11 +332,13 @@ def _solved_frames(images: list[MappedImage], registered: list[int], limit: int)
     return sorted(keyframes + fill)
 
 
-def _add_frames_between(
-    result: Polished, images: list[MappedImage], registered: list[int], guess: float, options: Options
-) -> None:
-    """Register the frames that were left out on the polished points; `guess` is the focal length of their tracks."""
+def _add_frames_between(result: Polished, images: list[MappedImage], registered: list[int], options: Options) -> None:
+    """Register the frames that were left out on the polished points."""
     state, m = result.state, options.mapper
+    seen = gather([images[f] for f in registered], result.tracks)
+    if result.lens is not None:
+        seen = result.lens.renormalize(seen)
+    by_frame = {f: np.nonzero(seen.frame == k)[0] for k, f in enumerate(registered)}
     focal = float(np.exp(state.log_focal))
     solved = np.array(result.frames)
     points = state.points
@@ -361,13 +346,12 @@ def _add_frames_between(
     for f in registered:
         if f in poses:
             continue
-        tracks = images[f].tracks
-        _, mine, theirs = np.intersect1d(tracks.ids, result.tracks, assume_unique=True, return_indices=True)
+        mine = by_frame[f]
         if len(mine) < m.min_inliers:
             continue
         near = int(solved[np.argmin(np.abs(solved - f))])
         found = register_image(
-            points[theirs], tracks.xy[mine] * (guess / focal), *poses[near],
+            points[seen.point[mine]], seen.xy[mine], *poses[near],
             focal=focal, sigma=max(result.sigma, SMALLEST_SIGMA_PX), inlier_px=m.inlier_px,
         )  # fmt: skip
         if found.inliers.sum() >= m.min_inliers:
@@ -388,8 +372,9 @@ def _add_frames_between(
         p.images = new_row[p.images]
         p.observations = replace(p.observations, frame=new_row[p.observations.frame])
     result.frames = frames
-    observations = gather([images[f] for f in frames], result.tracks)
-    result.observations = replace(observations, xy=observations.xy * (guess / focal))
+    kept = np.isin(np.array(registered)[seen.frame], frames)
+    rows = np.searchsorted(frames, np.array(registered)[seen.frame[kept]])
+    result.observations = Observations(rows, seen.point[kept], seen.xy[kept])
     result.errors = BundleAdjustment(
         result.state, result.observations, options.polish, sigma=result.sigma
     ).reprojection_errors()

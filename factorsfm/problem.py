@@ -60,6 +60,7 @@ class State:
         rotation (k, 3, 3), translation (k, 3): `cam_from_world`.
         bearing (n, 3) unit, inverse_distance (n,): points seen from the world's origin.
         log_focal: logarithm of the focal length in pixels.
+        lens: (4,) distortion and principal point as in `factors.distort`, where they are estimated.
         scale, shift: (images,) affine of each image with a prior.
         field: (nodes,) smooth error of the prior in units of inverse depth, shared by all its images.
     """
@@ -69,6 +70,7 @@ class State:
     bearing: Array
     inverse_distance: Array
     log_focal: float
+    lens: Array = field(default_factory=lambda: np.zeros(4))
     scale: Array = field(default_factory=lambda: np.zeros(0))
     shift: Array = field(default_factory=lambda: np.zeros(0))
     field: Array = field(default_factory=lambda: np.zeros(0))

@@ -78,6 +78,25 @@ class CameraObservability:
     pixel_slide: float
 
 
+@dataclass(frozen=True, slots=True)
+class LensFit:
+    """What the shot says of a lens that was not given. Standard deviations are None where a value is no estimate.
+
+    Attributes:
+        determined: whether the focal length is an estimate; otherwise it is the guess.
+        focal_std: standard deviation of the focal length, relative.
+        k1_std, k2_std: of the radial distortion.
+        cx_std, cy_std: of the principal point, in focal lengths.
+    """
+
+    determined: bool
+    focal_std: float | None
+    k1_std: float | None = None
+    k2_std: float | None = None
+    cx_std: float | None = None
+    cy_std: float | None = None
+
+
 @dataclass(slots=True)
 class FrameResult:
     """One frame of the source.
@@ -139,6 +158,7 @@ class Reconstruction:
         parallax: largest camera displacement over the median point depth (paper, section 4).
         point_std: (n,) standard deviation of the inverse distance of each point from the first registered camera,
             relative to it, in the unit of `FrameResult.covariance`; None where it is not known.
+        lens: how far the shot determines the lens; None where it was given.
         metric: whether the world unit is the metre (the prior is metric).
         notes: sentences that a user should read (translation unobservable, focal length guessed, ...).
         seconds: wall time by stage.
@@ -158,6 +178,7 @@ class Reconstruction:
     kind: ShotKind
     parallax: float
     point_std: NDArray[np.float64] | None = None
+    lens: LensFit | None = None
     metric: bool = False
     notes: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)

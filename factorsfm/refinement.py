@@ -9,12 +9,12 @@ distance, in which small motion is almost linear.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.factors import affine_inverse_depth, by_pose, cauchy, cross_matrices, reprojection
+from factorsfm.elimination import Block, Elimination, Normal, Term, conditioned, reduced
+from factorsfm.factors import affine_inverse_depth, by_pose, cauchy, cross_matrices, distort, reprojection
 from factorsfm.marginals import Marginals, tangent_basis
 from factorsfm.options import PolishOptions
 from factorsfm.problem import Observations, PriorObservations, State
@@ -25,37 +25,8 @@ Index = NDArray[np.int64]
 # The camera side's step at a state, from its information matrix and gradient with the points eliminated.
 CameraSolver = Callable[[State, Array, Array], Array]
 
-_CHUNK = 512  # points eliminated together
 _FIRST_DAMPING = 1e-4
 _LARGEST_DAMPING = 1e6
-
-
-@dataclass(frozen=True, slots=True)
-class _Term:
-    """Linearised residuals, the observations along the last axis (contiguous, so that numpy runs at full speed).
-
-    Attributes:
-        residual: (d, m); by_camera: (c, d, m); by_point: (3, d, m).
-        columns: (m, c) camera-side variables of `by_camera`; frame, point: (m,).
-    """
-
-    residual: Array
-    by_camera: Array
-    columns: Index
-    by_point: Array
-    frame: Index
-    point: Index
-
-
-@dataclass(slots=True)
-class _Normal:
-    """Normal equations before the points are eliminated."""
-
-    camera: Array  # (c, c)
-    camera_gradient: Array  # (c,)
-    point: Array  # (n, 3, 3)
-    point_gradient: Array  # (n, 3)
-    terms: list[_Term]
 
 
 def _newton_step(state: State, information: Array, gradient: Array) -> Array:
@@ -70,6 +41,8 @@ class BundleAdjustment:
         sigma: standard deviation of an observation (pixels).
         free_translation: False estimates rotations and bearings alone.
         free_focal: whether the focal length is estimated.
+        lens_sigmas: (4,) standard deviations with which `State.lens` is known beforehand (0: exactly); None: it is
+            zero, the observations are undistorted.
         points_only: True holds everything but the points fixed.
         fixed: (k,) frames whose poses are held; by default the first, which is the world.
         prior: depth-prior values, or None.
@@ -84,6 +57,7 @@ class BundleAdjustment:
         sigma: float,
         free_translation: bool = True,
         free_focal: bool = False,
+        lens_sigmas: Array | None = None,
         points_only: bool = False,
         fixed: NDArray[np.bool_] | None = None,
         prior: PriorObservations | None = None,
@@ -97,21 +71,26 @@ class BundleAdjustment:
         self.prior = prior
         self.iterations = 0
         self._anchor = state.inverse_distance.copy()
-        self._pixels = observations.xy * np.exp(state.log_focal)  # what was measured, whatever the focal length
+        self._lens_sigmas = lens_sigmas
+        self._lens_anchor = state.lens
+        seen = observations.xy if lens_sigmas is None else distort(observations.xy, state.lens)[0]
+        self._pixels = seen * np.exp(state.log_focal)  # what was measured, whatever the lens
         frames, images, nodes = len(state.rotation), len(state.scale), len(state.field)
         self._lens = 6 * frames
-        self._affine = self._lens + 1
+        self._affine = self._lens + (1 if lens_sigmas is None else 5)
         self._field = self._affine + 2 * images
         self._columns = self._field + nodes
         free = np.ones(self._columns, bool)
         held = np.arange(frames) == 0 if fixed is None else fixed
         free[: self._lens] = np.repeat(~held, 6)
         free[self._lens] = free_focal
+        if lens_sigmas is not None:
+            free[self._lens + 1 : self._affine] = lens_sigmas > 0
         if not free_translation:
             free[: self._lens].reshape(-1, 6)[:, 3:] = False
         self._free = np.nonzero(free & (not points_only))[0]
-        self._groups: list[list[tuple[Index, Index, Index]]] | None = None
-        self._chunks: list[tuple[list[NDArray[np.intp]], Index, slice]] | None = None
+        self.free_lens = np.nonzero(free[self._lens : self._affine])[0]  # of log focal length and `State.lens`
+        self._elimination = Elimination(self._columns, len(state.bearing))
 
     # --- residuals ----------------------------------------------------------------------------------------------
 
@@ -132,13 +111,30 @@ class BundleAdjustment:
         return cauchy(self._reprojection(self.state)[0], self.options.kernel)[0]
 
     def _reprojection(self, state: State) -> tuple[Array, Array, Array]:
-        o = self.observations
+        o, focal = self.observations, np.exp(state.log_focal)
         q = state.camera_points(o.frame, o.point)
         behind = q[:, 2] <= 1e-6
         q[behind, 2] = 1e-6
-        residual, by_q = reprojection(q, self._pixels, np.exp(state.log_focal))
+        residual, by_q = reprojection(q, self._pixels, focal)
+        if self._lens_sigmas is not None:
+            uv, by_uv, _ = distort(q[:, :2] / q[:, 2:], state.lens)
+            residual, by_q = focal * uv - self._pixels, by_uv @ by_q
         by_q[behind] = 0.0
         return residual / self.sigma, by_q / self.sigma, q
+
+    def _by_lens(self, residual: Array, q: Array) -> Array:
+        """(m, 2, c) derivative of the residuals by the columns of the lens."""
+        by_focal = (residual + self._pixels / self.sigma)[:, :, None]  # d r / d log f is the prediction
+        if self._lens_sigmas is None:
+            return np.asarray(by_focal)
+        by_lens = distort(q[:, :2] / q[:, 2:], self.state.lens)[2] * (np.exp(self.state.log_focal) / self.sigma)
+        return np.concatenate([by_focal, by_lens], 2)
+
+    def _lens_prior(self, state: State) -> tuple[Array, Array]:
+        """Differences to what is known of the lens, and the information; none of it where nothing is estimated."""
+        sigmas = np.zeros(4) if self._lens_sigmas is None else self._lens_sigmas
+        free = sigmas > 0
+        return np.where(free, state.lens - self._lens_anchor, 0.0), np.where(free, sigmas, np.inf) ** -2.0
 
     def prior_residuals(self, state: State | None = None) -> Array:
         """(m,) residuals of the prior (unit of its inverse depth)."""
@@ -158,6 +154,8 @@ class BundleAdjustment:
     def _cost(self, state: State) -> float:
         cost = cauchy(self._reprojection(state)[0], self.options.kernel)[0].sum()
         cost += 0.5 * (((state.inverse_distance - self._anchor) / self._point_sigma) ** 2).sum()
+        difference, information = self._lens_prior(state)
+        cost += 0.5 * (information * difference**2).sum()
         if (p := self.prior) is not None:
             cost += cauchy(self._prior(state)[0][:, None], self.options.kernel)[0].sum()
             cost += 0.5 * state.field @ p.field_information @ state.field
@@ -171,18 +169,19 @@ class BundleAdjustment:
 
     # --- linearisation ------------------------------------------------------------------------------------------
 
-    def _terms(self) -> list[_Term]:
+    def _terms(self) -> list[Term]:
         s, o = self.state, self.observations
         tangent = tangent_basis(s.bearing)
         residual, by_q, q = self._reprojection(s)
         weight = np.sqrt(cauchy(residual, self.options.kernel)[1])
         gain = np.ascontiguousarray((by_q * weight[:, None, None]).transpose(1, 0, 2))
-        by_focal = gain[:, :, 0] * q[:, 0] + gain[:, :, 1] * q[:, 1]  # d r / d log f = f q_xy / q_z
-        by_camera = np.concatenate([by_pose(gain, q, s.inverse_distance[o.point]), by_focal[:, :, None]], 2)
+        by_lens = (self._by_lens(residual, q) * weight[:, None, None]).transpose(1, 0, 2)
+        by_camera = np.concatenate([by_pose(gain, q, s.inverse_distance[o.point]), by_lens], 2)
         by_point = gain.transpose(1, 0, 2) @ self._by_point(tangent, o.frame, o.point)
-        columns = np.concatenate([6 * o.frame[:, None] + np.arange(6), np.full((len(q), 1), self._lens)], 1)
+        lens = np.broadcast_to(np.arange(self._lens, self._affine), (len(q), self._affine - self._lens))
+        columns = np.concatenate([6 * o.frame[:, None] + np.arange(6), lens], 1)
         terms = [
-            _Term(
+            Term(
                 (residual * weight[:, None]).T,
                 np.ascontiguousarray(by_camera.transpose(2, 0, 1)),
                 columns,
@@ -205,7 +204,7 @@ class BundleAdjustment:
             affine = self._affine + 2 * p.image[:, None] + np.arange(2)
             columns = np.concatenate([6 * p.frame[:, None] + np.arange(6), affine, self._field + p.nodes], 1)
             terms.append(
-                _Term(
+                Term(
                     (value * weight)[None],
                     np.ascontiguousarray(by_camera.T)[:, None],
                     columns,
@@ -221,32 +220,19 @@ class BundleAdjustment:
         by_bearing = self.state.rotation[frame] @ tangent[point]
         return np.concatenate([by_bearing, self.state.translation[frame][:, :, None]], 2)
 
-    def _linearize(self) -> _Normal:
-        s, c, n = self.state, self._columns, len(self.state.bearing)
-        terms = self._terms()
-        camera, gradient = np.zeros((c, c)), np.zeros(c)
-        point, point_gradient = np.zeros((n, 3, 3)), np.zeros((n, 3))
-        for t, groups in zip(terms, self._frame_groups(terms), strict=True):
-            for rows, columns, local in groups:
-                entries = t.by_camera[:, :, rows]
-                dense = np.zeros((len(columns), *entries.shape[1:]))
-                if local.shape[0] == 1:
-                    dense[local[0]] = entries
-                else:
-                    np.put_along_axis(dense, np.broadcast_to(local.T[:, None], entries.shape), entries, 0)
-                dense = dense.reshape(len(columns), -1)
-                camera[np.ix_(columns, columns)] += dense @ dense.T
-                gradient[columns] += dense @ t.residual[:, rows].ravel()
-            seen, first = np.unique(t.point, return_index=True)
-            for i in range(3):
-                point_gradient[seen, i] += np.add.reduceat((t.by_point[i] * t.residual).sum(0), first)
-                for j in range(i, 3):
-                    sums = np.add.reduceat((t.by_point[i] * t.by_point[j]).sum(0), first)
-                    point[seen, i, j] += sums
-                    if j > i:
-                        point[seen, j, i] += sums
+    def _linearize(self) -> Normal:
+        s = self.state
+        normal = self._elimination.normal_equations(self._terms())
+        camera, gradient, point, point_gradient = (
+            normal.camera, normal.camera_gradient, normal.point, normal.point_gradient
+        )  # fmt: skip
         point[:, 2, 2] += 1.0 / self._point_sigma**2
         point_gradient[:, 2] += (s.inverse_distance - self._anchor) / self._point_sigma**2
+        if self._lens_sigmas is not None:
+            lens = np.arange(self._lens + 1, self._affine)
+            difference, information = self._lens_prior(s)
+            camera[lens, lens] += information
+            gradient[lens] += information * difference
         if (p := self.prior) is not None:
             affine = np.arange(self._affine, self._field)
             information = np.tile([p.scale_sigma**-2.0, p.shift_sigma**-2.0], len(s.scale))
@@ -254,91 +240,23 @@ class BundleAdjustment:
             gradient[affine] += information * np.stack([s.scale - 1.0, s.shift], -1).ravel()
             camera[self._field :, self._field :] += p.field_information
             gradient[self._field :] += p.field_information @ s.field
-        return _Normal(camera, gradient, point, point_gradient, terms)
-
-    def _frame_groups(self, terms: list[_Term]) -> list[list[tuple[Index, Index, Index]]]:
-        """For every term and frame: its rows, their columns, and the position of each entry among the columns.
-
-        The positions have a single row where they are the same for all rows of the frame.
-        """
-        if self._groups is None:
-            self._groups = []
-            for t in terms:
-                order = np.argsort(t.frame, kind="stable")
-                groups = []
-                for rows in np.split(order, np.nonzero(np.diff(t.frame[order]))[0] + 1):
-                    columns, local = np.unique(t.columns[rows], return_inverse=True)
-                    local = local.reshape(len(rows), -1)
-                    groups.append((rows, columns, local[:1] if (local == local[:1]).all() else local))
-                self._groups.append(groups)
-        return self._groups
-
-    def _chunk_indices(self, terms: list[_Term]) -> list[tuple[list[NDArray[np.intp]], Index, slice]]:
-        """For every chunk of points: flat positions of the cross blocks of each term, the columns, the points."""
-        if self._chunks is None:
-            self._chunks = []
-            n = len(self.state.bearing)
-            for begin in range(0, n, _CHUNK):
-                end = min(n, begin + _CHUNK)
-                rows = [slice(*np.searchsorted(t.point, [begin, end])) for t in terms]
-                columns = np.unique(np.concatenate([t.columns[r].ravel() for t, r in zip(terms, rows, strict=True)]))
-                flat = []
-                for t, r in zip(terms, rows, strict=True):
-                    local = np.searchsorted(columns, t.columns[r])
-                    position = local.T[:, None] * 3 * (end - begin) + 3 * (t.point[r] - begin)
-                    flat.append((position + np.arange(3)[:, None]).ravel())
-                self._chunks.append((flat, columns, slice(begin, end)))
-        return self._chunks
-
-    def _cross_blocks(self, normal: _Normal) -> list[tuple[Array, Index, slice]]:
-        """Camera-point blocks of the information matrix, dense over the columns of each chunk."""
-        blocks = []
-        for flat, columns, span in self._chunk_indices(normal.terms):
-            n = span.stop - span.start
-            cross = np.zeros(len(columns) * 3 * n)
-            for t, position in zip(normal.terms, flat, strict=True):
-                rows = slice(*np.searchsorted(t.point, [span.start, span.stop]))
-                a, b = t.by_camera[:, :, rows], t.by_point[:, :, rows]
-                values = sum(a[:, None, d] * b[None, :, d] for d in range(a.shape[1]))
-                cross += np.bincount(position, np.ravel(values), len(cross))
-            blocks.append((cross.reshape(len(columns), 3 * n), columns, span))
-        return blocks
+        return normal
 
     # --- solving ------------------------------------------------------------------------------------------------
-
-    def _reduced(
-        self, normal: _Normal, blocks: list[tuple[Array, Index, slice]], damping: float
-    ) -> tuple[Array, Array, Array]:
-        """Information and gradient of the camera side with the points eliminated, and the points' covariance."""
-        point = normal.point.copy()
-        diagonal = np.einsum("nii->ni", point)
-        diagonal += damping * diagonal + 1e-12
-        point_covariance = np.asarray(np.linalg.inv(point), np.float64)
-        root = np.linalg.cholesky(point_covariance)
-        information = normal.camera.copy()
-        information[np.diag_indices_from(information)] *= 1.0 + damping
-        gradient = normal.camera_gradient.copy()
-        for cross, columns, span in blocks:
-            n = span.stop - span.start
-            half = (cross.reshape(-1, n, 3).transpose(1, 0, 2) @ root[span]).transpose(1, 0, 2).reshape(-1, 3 * n)
-            information[np.ix_(columns, columns)] -= half @ half.T
-            step = np.einsum("nij,nj->ni", point_covariance[span], normal.point_gradient[span])
-            gradient[columns] -= cross @ step.ravel()
-        return information, gradient, point_covariance
 
     def condensed(self) -> tuple[Array, Array]:
         """Information matrix and gradient of the free camera side at the present state, the points eliminated."""
         normal = self._linearize()
-        information, gradient, _ = self._reduced(normal, self._cross_blocks(normal), 0.0)
-        return _conditioned(information[np.ix_(self._free, self._free)]), gradient[self._free]
+        information, gradient, _ = reduced(normal, self._elimination.cross_blocks(normal), 0.0)
+        return conditioned(information[np.ix_(self._free, self._free)]), gradient[self._free]
 
     def _step(
-        self, normal: _Normal, blocks: list[tuple[Array, Index, slice]], damping: float, solve_cameras: CameraSolver
+        self, normal: Normal, blocks: list[Block], damping: float, solve_cameras: CameraSolver
     ) -> tuple[Array, Array]:
-        information, gradient, point_covariance = self._reduced(normal, blocks, damping)
+        information, gradient, point_covariance = reduced(normal, blocks, damping)
         free = self._free
         camera = np.zeros(self._columns)
-        camera[free] = solve_cameras(self.state, _conditioned(information[np.ix_(free, free)]), gradient[free])
+        camera[free] = solve_cameras(self.state, conditioned(information[np.ix_(free, free)]), gradient[free])
         point = np.empty((len(self.state.bearing), 3))
         for cross, columns, span in blocks:
             pull = normal.point_gradient[span] + (camera[columns] @ cross).reshape(-1, 3)
@@ -349,15 +267,23 @@ class BundleAdjustment:
         s = self.state
         pose = camera[: self._lens].reshape(-1, 6)
         turn = _exponential(-pose[:, :3])
-        bearing = s.bearing + np.einsum("nij,nj->ni", tangent_basis(s.bearing), point[:, :2])
+        by_lens = float(camera[self._lens])
+        # A new focal length moves the points along, so that the first camera sees them where it did: what the step
+        # says of that to first order is done in full.
+        stretch = np.array([np.exp(-by_lens), np.exp(-by_lens), 1.0])
+        tangent, side = tangent_basis(s.bearing), s.bearing * [1.0, 1.0, 0.0]
+        turned = point[:, :2] + by_lens * np.einsum("ni,nij->nj", side, tangent)
+        nearer = point[:, 2] - by_lens * s.inverse_distance * (side**2).sum(1)
+        bearing = (s.bearing + np.einsum("nij,nj->ni", tangent, turned)) * stretch
         length = np.linalg.norm(bearing, axis=1)
         affine = camera[self._affine : self._field].reshape(-1, 2)
         return State(
             rotation=turn @ s.rotation,
             translation=np.einsum("nij,nj->ni", turn, s.translation - pose[:, 3:]),
             bearing=bearing / length[:, None],
-            inverse_distance=(s.inverse_distance + point[:, 2]) / length,
-            log_focal=s.log_focal + float(camera[self._lens]),
+            inverse_distance=(s.inverse_distance + nearer) / length,
+            log_focal=s.log_focal + by_lens,
+            lens=s.lens if self._lens_sigmas is None else s.lens + camera[self._lens + 1 : self._affine],
             scale=s.scale + affine[:, 0],
             shift=s.shift + affine[:, 1],
             field=s.field + camera[self._field :],
@@ -374,7 +300,7 @@ class BundleAdjustment:
         cost = self.cost()
         for _ in range(iterations or self.options.iterations):
             normal = self._linearize()
-            blocks = self._cross_blocks(normal)
+            blocks = self._elimination.cross_blocks(normal)
             while damping < _LARGEST_DAMPING:
                 candidate = self._retract(*self._step(normal, blocks, damping, solve_cameras))
                 new_cost = self._cost(candidate)
@@ -415,17 +341,33 @@ class BundleAdjustment:
     def marginals(self) -> Marginals:
         """Everything that covariances are made of, at the present state."""
         normal = self._linearize()
-        blocks = self._cross_blocks(normal)
-        information, _, given_camera = self._reduced(normal, blocks, 0.0)
+        blocks = self._elimination.cross_blocks(normal)
+        information, _, given_camera = reduced(normal, blocks, 0.0)
         free = self._free
         camera = np.zeros((self._columns, self._columns))
-        camera[np.ix_(free, free)] = np.linalg.inv(_conditioned(information[np.ix_(free, free)]))
+        camera[np.ix_(free, free)] = np.linalg.inv(conditioned(information[np.ix_(free, free)]))
         return Marginals(camera, given_camera, blocks)
 
+    def influences(self, columns: Index) -> Array:
+        """(n, p) by how much the residuals of each point alone move some columns of the camera side.
 
-def _conditioned(information: Array) -> Array:
-    """The matrix with a ridge far below any information that matters."""
-    return np.asarray(information + np.diag(1e-12 * np.maximum(information.diagonal(), 1e-300)))
+        At the minimum they cancel; their squares tell how uncertain the columns are, whatever the noise really is.
+        """
+        normal = self._linearize()
+        blocks = self._elimination.cross_blocks(normal)
+        information, _, given_camera = reduced(normal, blocks, 0.0)
+        free = self._free
+        gain = np.zeros((self._columns, len(columns)))
+        gain[free] = np.linalg.inv(conditioned(information[np.ix_(free, free)]))[:, np.searchsorted(free, columns)]
+        moved = np.zeros((len(self.state.bearing), len(columns)))
+        for t in normal.terms:
+            by_camera = np.einsum("cdm,dm->mc", t.by_camera, t.residual)
+            np.add.at(moved, t.point, np.einsum("mc,mcp->mp", by_camera, gain[t.columns]))
+        step = np.einsum("nij,nj->ni", given_camera, normal.point_gradient)
+        for cross, used, span in blocks:
+            pull = cross.reshape(len(used), -1, 3)
+            moved[span] -= np.einsum("cni,ni,cp->np", pull, step[span], gain[used], optimize=True)
+        return -moved
 
 
 def _exponential(rotation_vector: Array) -> Array:

@@ -9,13 +9,13 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.camera import with_focal
+from factorsfm.camera import with_focal, with_lens
 from factorsfm.images import MappedImage
+from factorsfm.lens import LensEstimate
 from factorsfm.observability import observability_notes
-from factorsfm.options import FOCAL_STD
 from factorsfm.polish import Polished
 from factorsfm.problem import State
-from factorsfm.reconstruction import FrameResult, FrameStatus, PriorFit, Reconstruction, ShotKind
+from factorsfm.reconstruction import FrameResult, FrameStatus, LensFit, PriorFit, Reconstruction, ShotKind
 
 Array = NDArray[np.float64]
 
@@ -43,7 +43,6 @@ def assemble(
     *,
     prior_given: bool,
     metric: bool,
-    focal_guessed: bool,
     seconds: dict[str, float],
     options: dict[str, Any],
 ) -> Reconstruction:
@@ -55,13 +54,15 @@ def assemble(
         prior_given: whether there is a depth prior at all; metric: whether its unit is the metre.
     """
     has_depth = any(image.tracks.depth is not None for image in images)
-    state, notes = polished.state, _notes(polished, has_depth, focal_guessed)
+    state, notes = polished.state, _notes(polished, has_depth)
     if prior_given and not has_depth:
         notes.append("The depth prior took no part: no frame that needed it has a usable depth map.")
     scale = _metric_scale(polished, images) if metric else None
     unit = scale or 1.0
-    if focal_guessed:
-        camera = with_focal(camera, float(np.exp(state.log_focal)))
+    lens = polished.lens
+    if lens is not None:
+        focal, shape = lens.lens.focal, lens.lens.shape
+        camera = with_lens(camera, focal, shape) if shape.any() else with_focal(camera, focal)
     kept, row_of = _usable_points(polished)
     observations = polished.observations
     keep = row_of[observations.point] >= 0
@@ -98,6 +99,7 @@ def assemble(
         kind=polished.motion.kind,
         parallax=_parallax(state),
         point_std=polished.point_std[kept] / state.inverse_distance[kept] if general else None,
+        lens=_lens_fit(lens) if lens is not None else None,
         metric=scale is not None,
         notes=notes,
         seconds=seconds,
@@ -187,7 +189,7 @@ def _prior_fits(polished: Polished, images: list[MappedImage], unit: float) -> d
     return fits
 
 
-def _notes(polished: Polished, has_depth: bool, focal_guessed: bool) -> list[str]:
+def _notes(polished: Polished, has_depth: bool) -> list[str]:
     notes: list[str] = []
     motion = polished.motion
     depths = "depths and their scale come from the prior alone" if has_depth else "depths are unknown without a prior"
@@ -200,10 +202,22 @@ def _notes(polished: Polished, has_depth: bool, focal_guessed: bool) -> list[str
             "The camera only rotates: its translation is not observable from geometry and is reported as zero; "
             f"{depths}."
         )
-    if focal_guessed:
-        focal, std = float(np.exp(polished.state.log_focal)), polished.focal_std
-        if std is not None and std <= FOCAL_STD:
-            notes.append(f"The focal length was estimated: {focal:.0f} pixels, standard deviation {100 * std:.1f} %.")
-        else:
-            notes.append(f"The focal length is a guess ({focal:.0f} pixels): this shot does not determine it.")
+    if polished.lens is not None:
+        notes.append(_lens_note(polished.lens))
     return notes
+
+
+def _lens_note(estimate: LensEstimate) -> str:
+    focal, std = estimate.lens.focal, f"standard deviation {100 * estimate.focal_std:.1f} %"
+    if not estimate.determined:
+        return f"The focal length is a guess ({focal:.0f} pixels): this shot does not determine it ({std})."
+    note = f"The focal length was estimated: {focal:.0f} pixels, {std}"
+    if np.isfinite(estimate.shape_std[0]):
+        k, k_std = estimate.lens.shape, estimate.shape_std
+        note += f"; radial distortion k1 {k[0]:.3f} ± {k_std[0]:.3f}, k2 {k[1]:.3f} ± {k_std[1]:.3f}"
+    return note + "."
+
+
+def _lens_fit(estimate: LensEstimate) -> LensFit:
+    shape = [float(std) if np.isfinite(std) else None for std in estimate.shape_std]
+    return LensFit(estimate.determined, estimate.focal_std if estimate.determined else None, *shape)

@@ -7,7 +7,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import astuple, dataclass, replace
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from factorsfm.camera import (
     camera_to_json,
     check_camera,
     guess_camera,
+    lens_shape,
     normalized_from_pixels,
     pixels_from_normalized,
     with_focal,
@@ -47,7 +48,7 @@ from factorsfm.tracks.flow import BLANK_TEXTURE, FlowTracker
 
 logger = logging.getLogger(__name__)
 
-_STATE = ("_size", "_colors", "_pixels", "_focal_guessed", "_without_depth")
+_STATE = ("_size", "_colors", "_pixels", "_without_depth")
 _REVIVAL_INTERVAL = 5  # frames
 
 
@@ -99,7 +100,6 @@ class Stream(Closing):
         self._size = (0, 0)
         self._colors = np.zeros((0, 3), np.uint8)
         self._pixels: list[NDArray[np.float64]] = []
-        self._focal_guessed = False
         self._without_depth: list[str] = []  # why the prior failed, once for every frame
 
     def push(self, frame: Frame | NDArray[np.uint8]) -> FrameUpdate:
@@ -254,6 +254,7 @@ class Stream(Closing):
                 mapper.focal,
                 self.options,
                 lambda stage: progress(stage, 0, None) if progress else None,
+                lens_shape(self.camera) if self.options.refine_focal_length else None,
             )
         reconstruction = assemble(
             result,
@@ -264,7 +265,6 @@ class Stream(Closing):
             self.camera,
             prior_given=self._depth is not None,
             metric=self._depth is not None and self._depth.kind is DepthKind.METRIC,
-            focal_guessed=self._focal_guessed,
             seconds=dict(self.seconds),
             options=self.options.to_dict(),
         )
@@ -310,9 +310,10 @@ class Stream(Closing):
         height, width = frame.image.shape[:2]
         if self.camera is None:
             self.camera = guess_camera(width, height)
-            self.options = replace(self.options, refine_focal_length=True)
-        self._focal_guessed = self.options.refine_focal_length
+            self.options = self.options.for_unknown_lens()
         check_camera(self.camera, width, height)
+        if self.options.refine_focal_length:
+            lens_shape(self.camera)  # refuses what cannot be estimated
         self._size = (width, height)
         self._mapper = self._new_mapper()
         return self._mapper

@@ -96,7 +96,7 @@ def run(arguments: argparse.Namespace, progress: Progress, show: Show) -> str:
     camera = read_camera(arguments.camera) if arguments.camera else None
     frames = parse_range(arguments.frames) if arguments.frames else None
     raw = RawFormat.parse(arguments.raw) if arguments.raw else None
-    options = Options.preset_named(arguments.preset)
+    options = replace(Options.preset_named(arguments.preset), lens=arguments.lens)
     depth = open_depth(unless_none(arguments.depth), arguments.depth_kind) if options.uses_depth else None
     masks = open_masks(unless_none(arguments.masks))
     with open_viewer(arguments.viewer, arguments.record) as viewer:
@@ -119,7 +119,7 @@ def run(arguments: argparse.Namespace, progress: Progress, show: Show) -> str:
                     if target is None:
                         if camera is None:
                             camera = guessed_camera(arguments.source, frame)
-                            options = replace(options, refine_focal_length=True)
+                            options = options.for_unknown_lens()
                         kind = Episode if arguments.cuts else Stream
                         target = kind(camera, depth=watched, masks=masks, options=options)
                     start = time.perf_counter()

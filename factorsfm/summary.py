@@ -46,6 +46,7 @@ def summary(reconstruction: Reconstruction) -> dict[str, Any]:
         "observability": pooled_observability(reconstruction),
         "focal_length": reconstruction.camera.mean_focal_length(),
         "camera": camera_to_json(reconstruction.camera),
+        "lens": reconstruction.lens and asdict(reconstruction.lens),
         "seconds": with_total(reconstruction.seconds),
         "notes": reconstruction.notes,
         "statuses": [_frame_json(frame) for frame in reconstruction.frames],

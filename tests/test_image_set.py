@@ -119,7 +119,7 @@ def test_a_guessed_focal_length_is_corrected_with_the_map() -> None:
     ring = Ring(8)
     guess = 1.2 * FOCAL
     tracks = [replace(t, xy=t.xy * FOCAL / guess) for t in ring.tracks()]
-    result = solve(tracks, replace(Options(), refine_focal_length=True), guess)
+    result = solve(tracks, Options(lens="focal"), guess)
     assert float(np.exp(result.state.log_focal)) == pytest.approx(FOCAL, rel=0.003)
     assert np.median(ring.errors(result.state.rotation, result.state.translation).ate) < 3e-3
 

@@ -174,7 +174,7 @@ def test_the_step_solves_the_whole_system():
             np.add.at(full, (here[:, None], columns), block.T)
     free = np.r_[6 : c + 3 * n]
     expected = -np.linalg.solve(full[np.ix_(free, free)], gradient[free])
-    camera, point = adjustment._step(normal, adjustment._cross_blocks(normal), 0.0, _newton_step)
+    camera, point = adjustment._step(normal, adjustment._elimination.cross_blocks(normal), 0.0, _newton_step)
     np.testing.assert_allclose(camera[:6], 0.0)
     np.testing.assert_allclose(np.append(camera[6:], point), expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max())
     inverse = np.linalg.inv(full[np.ix_(free, free)])

@@ -76,7 +76,7 @@ def _method(arguments: argparse.Namespace, *, several: bool) -> Method:
     if not (several and masks and Path(masks).is_dir()):
         open_masks(masks)
     camera = read_camera(arguments.camera) if arguments.camera else None
-    return Method(camera, depth, arguments.depth_kind, masks, arguments.preset)
+    return Method(camera, depth, arguments.depth_kind, masks, arguments.preset, arguments.lens)
 
 
 def _absolute(text: str | None) -> str | None:

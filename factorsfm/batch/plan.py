@@ -14,6 +14,7 @@ import pycolmap
 from factorsfm.camera import camera_to_json
 from factorsfm.errors import InputError
 from factorsfm.frames import list_files
+from factorsfm.options import LensFreedom
 from factorsfm.priors.masks import MaskFolder
 from factorsfm.shots import find_shots
 from factorsfm.summary import json_text
@@ -33,6 +34,7 @@ class Method:
     depth_kind: str | None = None
     masks: str | None = None
     preset: str = "default"
+    lens: LensFreedom = "auto"
 
     def of_video(self, name: str) -> Method:
         """With what belongs to this video of several: folders of its name in those of maps and masks."""
@@ -51,6 +53,7 @@ class Method:
             "depth_kind": self.depth_kind,
             "masks": self.masks,
             "preset": self.preset,
+            "lens": self.lens,
         }
 
 

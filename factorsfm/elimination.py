@@ -1,0 +1,155 @@
+"""Normal equations of residuals on cameras and points, and the elimination of the points from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+# Camera-point block of the information matrix (columns, 3 n), its columns, and its points.
+Block = tuple[Array, Index, slice]
+
+_CHUNK = 512  # points eliminated together
+
+
+@dataclass(frozen=True, slots=True)
+class Term:
+    """Linearised residuals, the observations along the last axis (contiguous, so that numpy runs at full speed).
+
+    Attributes:
+        residual: (d, m); by_camera: (c, d, m); by_point: (3, d, m).
+        columns: (m, c) camera-side variables of `by_camera`; frame, point: (m,).
+    """
+
+    residual: Array
+    by_camera: Array
+    columns: Index
+    by_point: Array
+    frame: Index
+    point: Index
+
+
+@dataclass(slots=True)
+class Normal:
+    """Normal equations before the points are eliminated."""
+
+    camera: Array  # (c, c)
+    camera_gradient: Array  # (c,)
+    point: Array  # (n, 3, 3)
+    point_gradient: Array  # (n, 3)
+    terms: list[Term]
+
+
+class Elimination:
+    """Sums and blocks over residuals whose variables are the same at every linearisation.
+
+    Args:
+        columns, points: how many variables the camera side has, and how many points there are.
+    """
+
+    def __init__(self, columns: int, points: int) -> None:
+        self._columns, self._points = columns, points
+        self._groups: list[list[tuple[Index, Index, Index]]] | None = None
+        self._chunks: list[tuple[list[NDArray[np.intp]], Index, slice]] | None = None
+
+    def normal_equations(self, terms: list[Term]) -> Normal:
+        """Information and gradient of the cameras and of each point; each term is sorted by point."""
+        c, n = self._columns, self._points
+        camera, gradient = np.zeros((c, c)), np.zeros(c)
+        point, point_gradient = np.zeros((n, 3, 3)), np.zeros((n, 3))
+        for t, groups in zip(terms, self._frame_groups(terms), strict=True):
+            for rows, columns, local in groups:
+                entries = t.by_camera[:, :, rows]
+                dense = np.zeros((len(columns), *entries.shape[1:]))
+                if local.shape[0] == 1:
+                    dense[local[0]] = entries
+                else:
+                    np.put_along_axis(dense, np.broadcast_to(local.T[:, None], entries.shape), entries, 0)
+                dense = dense.reshape(len(columns), -1)
+                camera[np.ix_(columns, columns)] += dense @ dense.T
+                gradient[columns] += dense @ t.residual[:, rows].ravel()
+            seen, first = np.unique(t.point, return_index=True)
+            for i in range(3):
+                point_gradient[seen, i] += np.add.reduceat((t.by_point[i] * t.residual).sum(0), first)
+                for j in range(i, 3):
+                    sums = np.add.reduceat((t.by_point[i] * t.by_point[j]).sum(0), first)
+                    point[seen, i, j] += sums
+                    if j > i:
+                        point[seen, j, i] += sums
+        return Normal(camera, gradient, point, point_gradient, terms)
+
+    def _frame_groups(self, terms: list[Term]) -> list[list[tuple[Index, Index, Index]]]:
+        """For every term and frame: its rows, their columns, and the position of each entry among the columns.
+
+        The positions have a single row where they are the same for all rows of the frame.
+        """
+        if self._groups is None:
+            self._groups = []
+            for t in terms:
+                order = np.argsort(t.frame, kind="stable")
+                groups = []
+                for rows in np.split(order, np.nonzero(np.diff(t.frame[order]))[0] + 1):
+                    columns, local = np.unique(t.columns[rows], return_inverse=True)
+                    local = local.reshape(len(rows), -1)
+                    groups.append((rows, columns, local[:1] if (local == local[:1]).all() else local))
+                self._groups.append(groups)
+        return self._groups
+
+    def _chunk_indices(self, terms: list[Term]) -> list[tuple[list[NDArray[np.intp]], Index, slice]]:
+        """For every chunk of points: flat positions of the cross blocks of each term, the columns, the points."""
+        if self._chunks is None:
+            self._chunks = []
+            n = self._points
+            for begin in range(0, n, _CHUNK):
+                end = min(n, begin + _CHUNK)
+                rows = [slice(*np.searchsorted(t.point, [begin, end])) for t in terms]
+                columns = np.unique(np.concatenate([t.columns[r].ravel() for t, r in zip(terms, rows, strict=True)]))
+                flat = []
+                for t, r in zip(terms, rows, strict=True):
+                    local = np.searchsorted(columns, t.columns[r])
+                    position = local.T[:, None] * 3 * (end - begin) + 3 * (t.point[r] - begin)
+                    flat.append((position + np.arange(3)[:, None]).ravel())
+                self._chunks.append((flat, columns, slice(begin, end)))
+        return self._chunks
+
+    def cross_blocks(self, normal: Normal) -> list[Block]:
+        """Camera-point blocks of the information matrix, dense over the columns of each chunk."""
+        blocks = []
+        for flat, columns, span in self._chunk_indices(normal.terms):
+            n = span.stop - span.start
+            cross = np.zeros(len(columns) * 3 * n)
+            for t, position in zip(normal.terms, flat, strict=True):
+                rows = slice(*np.searchsorted(t.point, [span.start, span.stop]))
+                a, b = t.by_camera[:, :, rows], t.by_point[:, :, rows]
+                values = sum(a[:, None, d] * b[None, :, d] for d in range(a.shape[1]))
+                cross += np.bincount(position, np.ravel(values), len(cross))
+            blocks.append((cross.reshape(len(columns), 3 * n), columns, span))
+        return blocks
+
+
+def reduced(normal: Normal, blocks: list[Block], damping: float) -> tuple[Array, Array, Array]:
+    """Information and gradient of the camera side with the points eliminated, and the points' covariance."""
+    point = normal.point.copy()
+    diagonal = np.einsum("nii->ni", point)
+    diagonal += damping * diagonal + 1e-12
+    point_covariance = np.asarray(np.linalg.inv(point), np.float64)
+    root = np.linalg.cholesky(point_covariance)
+    information = normal.camera.copy()
+    information[np.diag_indices_from(information)] *= 1.0 + damping
+    gradient = normal.camera_gradient.copy()
+    for cross, columns, span in blocks:
+        n = span.stop - span.start
+        half = (cross.reshape(-1, n, 3).transpose(1, 0, 2) @ root[span]).transpose(1, 0, 2).reshape(-1, 3 * n)
+        information[np.ix_(columns, columns)] -= half @ half.T
+        step = np.einsum("nij,nj->ni", point_covariance[span], normal.point_gradient[span])
+        gradient[columns] -= cross @ step.ravel()
+    return information, gradient, point_covariance
+
+
+def conditioned(information: Array) -> Array:
+    """The matrix with a ridge far below any information that matters."""
+    return np.asarray(information + np.diag(1e-12 * np.maximum(information.diagonal(), 1e-300)))

@@ -1,0 +1,255 @@
+"""An unknown lens: a search over fields of view, then focal length, distortion and principal point in the polish."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from factorsfm.factors import distort
+from factorsfm.noise import block_inflation, coordinate_sigma
+from factorsfm.observability import classify_motion
+from factorsfm.options import FOCAL_STD, Options, PolishOptions
+from factorsfm.problem import Observations, State
+from factorsfm.reconstruction import ShotKind
+from factorsfm.refinement import BundleAdjustment
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+logger = logging.getLogger(__name__)
+
+_FIELDS_OF_VIEW = np.radians(np.geomspace(20.0, 100.0, 8))  # across the longer side of what the tracks fill
+_SEARCH_FRAMES, _SEARCH_ITERATIONS, _PARABOLAS = 24, 15, 3
+_TOLERANCE = 1e-5  # the focal length lies along a flat valley
+_DISTORTION_SIGMA = 0.1
+_CENTER_SIGMA = 0.02  # of the width
+_LARGEST_RATIO = 4.0  # of the focal length to its guess
+_CELLS = (6, 4)  # across and down, in which the errors of tracks may be alike
+# Distortion is believed where noise hardly explains it, and where it is large: tracks that err together, of an actor
+# without a mask above all, look like a displacement of 2 thousandths of the width.
+_LEAST_EVIDENCE = 16.0  # squared standard deviations
+_LEAST_DISPLACEMENT = 0.004  # of the width, at the outermost tracks
+
+
+@dataclass(frozen=True, slots=True)
+class Lens:
+    """A focal length (pixels), and (4,) distortion and principal point as in `factors.distort`."""
+
+    focal: float
+    shape: Array
+
+
+@dataclass(frozen=True, slots=True)
+class LensEstimate:
+    """What became of an unknown lens.
+
+    Attributes:
+        guess: with which the tracks were undistorted; lens: what the shot says, or the guess.
+        focal_std: relative standard deviation of the estimated focal length, believed or not.
+        shape_std: (4,) standard deviations of the shape, NaN where it stays as guessed.
+        determined: whether the focal length is an estimate, not the guess.
+    """
+
+    guess: Lens
+    lens: Lens
+    focal_std: float
+    shape_std: Array
+    determined: bool
+
+    def renormalize(self, observations: Observations) -> Observations:
+        """What was undistorted by the guess, undistorted by the lens."""
+        return renormalized(observations, self.guess, self.lens)
+
+
+def undistort(xy: Array, shape: Array) -> Array:
+    """Inverse of `factors.distort`: (n, 2) undistorted coordinates, NaN where there are none."""
+    if not shape.any():
+        return xy
+    k1, k2, x, y = shape
+    camera = pycolmap.Camera(model="RADIAL", width=1, height=1, params=[1.0, x, y, k1, k2])
+    return np.asarray(camera.cam_from_img(xy), np.float64)
+
+
+def renormalized(observations: Observations, before: Lens, after: Lens) -> Observations:
+    """The same pixels, undistorted by another lens."""
+    seen = distort(observations.xy, before.shape)[0] if before.shape.any() else observations.xy
+    return replace(observations, xy=undistort(seen * (before.focal / after.focal), after.shape))
+
+
+def through(state: State, focal: float) -> State:
+    """The state with another focal length: points where the first camera sees them, at the depth that they have."""
+    stretch = np.exp(state.log_focal) / focal
+    bearing = state.bearing * [stretch, stretch, 1.0]
+    length = np.linalg.norm(bearing, axis=1)
+    return replace(
+        state,
+        bearing=bearing / length[:, None],
+        inverse_distance=state.inverse_distance / length,
+        log_focal=float(np.log(focal)),
+    )
+
+
+def estimate_lens(adjustment: BundleAdjustment, guess: Lens, options: Options) -> tuple[BundleAdjustment, LensEstimate]:
+    """The lens where the shot determines it, else the guess; and the cameras with it.
+
+    Args:
+        adjustment: converged with the guess.
+
+    Returns:
+        The adjustment with undistorted observations, whose `observations` are those of the lens.
+    """
+    o = replace(options.polish, tolerance=_TOLERANCE)
+    width = float(np.ptp(adjustment.observations.xy, axis=0).max())
+    sigmas = {
+        "focal": np.zeros(4),
+        "distortion": np.array([_DISTORTION_SIGMA, _DISTORTION_SIGMA, 0.0, 0.0]),
+        "all": np.array([_DISTORTION_SIGMA, _DISTORTION_SIGMA, _CENTER_SIGMA * width, _CENTER_SIGMA * width]),
+    }[options.lens]
+    focal = search_focal(adjustment, guess, o)
+    start = replace(through(adjustment.state, focal), lens=guess.shape)
+    observations = renormalized(adjustment.observations, guess, Lens(focal, guess.shape))
+    best = _solved(start, observations, o, adjustment.sigma, np.zeros(4))
+    motion = classify_motion(best, best.observations, options.polish)
+    moves = motion.kind is ShotKind.GENERAL
+    if not moves:  # a translation that is none would bend with the lens
+        best = _solved(motion.rotation_only, best.observations, o, best.sigma, np.zeros(4), moves=False)
+    std = _standard_deviations(best)[0]
+    if sigmas.any():
+        full = _solved(best.state, best.observations, o, best.sigma, sigmas, moves=moves)
+        full_std, evidence = _standard_deviations(full, guess.shape)
+        displacement = _displacement(full, guess.shape)
+        logger.info(
+            "distortion %s, %.0f squared deviations, displaces by %.1f pixels; focal length within %.2f %%",
+            np.round(full.state.lens, 4), evidence, displacement, 100 * full_std[0],
+        )  # fmt: skip
+        wide = _LEAST_DISPLACEMENT * width * np.exp(full.state.log_focal)
+        usable = full_std[0] < FOCAL_STD and bool(np.isfinite(full.observations.xy).all())
+        if evidence > _LEAST_EVIDENCE and displacement > wide and usable:
+            best, std = full, full_std
+    lens = Lens(float(np.exp(best.state.log_focal)), best.state.lens)
+    logger.info("focal length %.1f pixels within %.2f %%, guess %.1f", lens.focal, 100 * std[0], guess.focal)
+    if not std[0] < FOCAL_STD or not 1 / _LARGEST_RATIO < lens.focal / guess.focal < _LARGEST_RATIO:
+        return adjustment, LensEstimate(guess, guess, float(std[0]), np.full(4, np.nan), False)
+    state = best.state if moves else through(start, lens.focal)
+    settled = BundleAdjustment(
+        replace(state, lens=np.zeros(4)), best.observations, options.polish, sigma=best.sigma
+    )  # fmt: skip
+    settled.solve()
+    return settled, LensEstimate(guess, lens, float(std[0]), std[1:], True)
+
+
+def search_focal(adjustment: BundleAdjustment, guess: Lens, options: PolishOptions) -> float:
+    """The focal length (pixels) with which a few frames fit best: candidates, then parabolas around the best."""
+    state, few = _some_frames(adjustment.state, adjustment.observations)
+    options = replace(options, iterations=_SEARCH_ITERATIONS, tolerance=1e-3)
+
+    def fit(near: State, focal: float) -> tuple[float, State]:
+        seen = renormalized(few, guess, Lens(focal, guess.shape))
+        problem = BundleAdjustment(through(near, focal), seen, options, sigma=adjustment.sigma)
+        problem.solve()
+        return problem.cost(), problem.state
+
+    half = 0.5 * guess.focal * float(np.ptp(few.xy, axis=0).max())
+    candidates = np.sort(half / np.tan(_FIELDS_OF_VIEW / 2))
+    fits = {guess.focal: fit(state, guess.focal)}
+    for side in (candidates[candidates > guess.focal], candidates[candidates < guess.focal][::-1]):
+        near = fits[guess.focal][1]
+        for focal in side.tolist():
+            fits[focal] = fit(near, focal)
+            near = fits[focal][1]
+    for _ in range(_PARABOLAS):
+        focals = sorted(fits)
+        best = min(range(len(focals)), key=lambda i: fits[focals[i]][0])
+        if best in (0, len(focals) - 1):
+            break
+        around = focals[best - 1 : best + 2]
+        x = np.log(np.array(around) / around[1])
+        curvature, slope, _ = np.polyfit(x, [fits[f][0] for f in around], 2)
+        focal = around[1] * float(np.exp(np.clip(-0.5 * slope / curvature, 0.5 * x[0], 0.5 * x[2])))
+        fits[focal] = fit(fits[around[1]][1], focal)
+    return min(fits, key=lambda f: fits[f][0])
+
+
+def _some_frames(state: State, observations: Observations) -> tuple[State, Observations]:
+    """Few frames, evenly spread, and the points that two of them see."""
+    count = len(state.rotation)
+    frames = np.unique(np.linspace(0, count - 1, min(count, _SEARCH_FRAMES)).astype(int))
+    keep = np.isin(observations.frame, frames)
+    seen = np.bincount(observations.point[keep], minlength=len(state.bearing)) >= 2
+    keep &= seen[observations.point]
+    points = np.flatnonzero(seen)
+    part = replace(
+        state,
+        rotation=state.rotation[frames],
+        translation=state.translation[frames],
+        bearing=state.bearing[points],
+        inverse_distance=state.inverse_distance[points],
+    )
+    frame, point = observations.frame[keep], observations.point[keep]
+    return part, Observations(
+        np.searchsorted(frames, frame), np.searchsorted(points, point), observations.xy[keep]
+    )  # fmt: skip
+
+
+def _solved(
+    state: State, observations: Observations, options: PolishOptions, sigma: float, sigmas: Array, *, moves: bool = True
+) -> BundleAdjustment:
+    """Converged over the lens too, first at the noise that is thought, then at that of the residuals.
+
+    Its observations are undistorted by the lens of its state.
+    """
+    known = None if not state.lens.any() and not sigmas.any() else sigmas
+    for _ in range(2):
+        problem = BundleAdjustment(
+            state, observations, options, sigma=sigma, free_focal=True, free_translation=moves, lens_sigmas=known
+        )
+        problem.solve()
+        before, after = (Lens(float(np.exp(s.log_focal)), s.lens) for s in (state, problem.state))
+        state, observations = problem.state, renormalized(observations, before, after)
+        sigma = coordinate_sigma(problem.reprojection_errors())
+    return BundleAdjustment(
+        state, observations, options, sigma=sigma, free_focal=True, free_translation=moves, lens_sigmas=known
+    )
+
+
+def _standard_deviations(adjustment: BundleAdjustment, guess: Array | None = None) -> tuple[Array, float]:
+    """(5,) of log focal length and shape, NaN where held; and the evidence that the shape is not the guess.
+
+    Errors that are alike for a while, or in a part of the image, count as one. Of two ways to see how many there are,
+    blocks of residuals and the pull of the tracks in each part of the image, the more doubtful one counts.
+    """
+    first = 6 * len(adjustment.state.rotation)
+    columns = first + adjustment.free_lens
+    whole, _ = adjustment.covariance(np.zeros(0, np.int64))
+    inflation = block_inflation(adjustment.reprojection_vectors(), adjustment.observations)
+    formal = whole[np.ix_(columns, columns)] * inflation
+    pulled = _pulled_covariance(adjustment, columns)
+    std = np.full(5, np.nan)
+    std[adjustment.free_lens] = np.sqrt(np.maximum(formal.diagonal(), pulled.diagonal()))
+    evidence = 0.0
+    if guess is not None:
+        away = (adjustment.state.lens - guess)[adjustment.free_lens[1:] - 1]
+        evidence = min(float(away @ np.linalg.solve(c[1:, 1:], away)) for c in (formal, pulled))
+    return std, evidence
+
+
+def _pulled_covariance(adjustment: BundleAdjustment, columns: Index) -> Array:
+    """Covariance from how differently the parts of the image pull at some columns."""
+    o, influence = adjustment.observations, adjustment.influences(columns)
+    xy = np.stack([np.bincount(o.point, o.xy[:, i]) for i in range(2)], -1) / np.bincount(o.point)[:, None]
+    low, high = xy.min(0), xy.max(0)
+    cell = (0.999 * (xy - low) / np.maximum(high - low, 1e-9) * _CELLS).astype(np.int64)
+    used, key = np.unique(cell[:, 1] * _CELLS[0] + cell[:, 0], return_inverse=True)
+    pull = np.stack([np.bincount(key, part) for part in influence.T], -1)
+    return np.asarray(pull.T @ pull * (len(used) / max(len(used) - 1, 1)))
+
+
+def _displacement(adjustment: BundleAdjustment, guess: Array) -> float:
+    """By how much the shape moves the outermost observations against the guess (pixels)."""
+    xy, focal = adjustment.observations.xy, float(np.exp(adjustment.state.log_focal))
+    moved = distort(xy, adjustment.state.lens)[0] - distort(xy, guess)[0]
+    return focal * float(np.percentile(np.linalg.norm(moved, axis=1), 99))

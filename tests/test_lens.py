@@ -1,0 +1,167 @@
+"""An unknown lens: found where the shot determines it, kept as guessed and called a guess where not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+import pytest
+from estimation_problems import make_problem, mapped_images
+
+from factorsfm import api
+from factorsfm.camera import PIXEL_CENTER, guess_camera, lens_shape, normalized_from_pixels, with_lens
+from factorsfm.cli import main
+from factorsfm.errors import InputError
+from factorsfm.factors import distort
+from factorsfm.lens import Lens, renormalized, through, undistort
+from factorsfm.options import FOCAL_STD, Options, PolishOptions
+from factorsfm.polish import polish
+from factorsfm.reconstruction import ShotKind
+from factorsfm.refinement import BundleAdjustment
+
+BARREL = np.array([-0.15, 0.02, 0.0, 0.0])
+
+
+def estimated(problem, *, guess=1.3, shape=None, lens="distortion"):
+    """The polish of a problem whose lens has a shape, from tracks that a guess normalised without it."""
+    truth = Lens(problem.focal, np.zeros(4))
+    seen = replace(
+        problem.observations, xy=distort(problem.observations.xy, np.zeros(4) if shape is None else shape)[0]
+    )
+    wrong = Lens(guess * problem.focal, np.zeros(4))
+    start = through(problem.truth, wrong.focal)
+    images = mapped_images(replace(problem, observations=renormalized(seen, truth, wrong)), start)
+    points = np.arange(len(start.bearing)), start.points
+    options = replace(Options.preset_named("geometry"), lens=lens)
+    return polish(images, points, wrong.focal, options)
+
+
+def assert_derivative(analytic, function, size, step=1e-6):
+    for i in range(size):
+        d = np.zeros(size)
+        d[i] = step
+        np.testing.assert_allclose(analytic[..., i], (function(d) - function(-d)) / (2 * step), atol=1e-8)
+
+
+def test_distortion_derivatives_and_inverse():
+    uv = np.random.default_rng(0).uniform(-0.6, 0.6, (50, 2))
+    shape = np.array([-0.15, 0.04, 0.01, -0.02])
+    distorted, by_uv, by_lens = distort(uv, shape)
+    assert_derivative(by_uv, lambda d: distort(uv + d, shape)[0], 2)
+    assert_derivative(by_lens, lambda d: distort(uv, shape + d)[0], 4)
+    np.testing.assert_allclose(undistort(distorted, shape), uv, atol=1e-9)
+
+
+@pytest.mark.parametrize("kernel", [2.0, 1e6])
+def test_the_gradient_of_the_lens_columns_is_that_of_the_cost(kernel):
+    problem = make_problem("handheld", frames=5, points=40, parallax=0.1, noise_px=1.0)
+    start = replace(problem.truth, lens=np.array([-0.1, 0.05, 0.003, 0.002]))
+    sigmas = np.array([0.1, 0.1, 0.02, 0.02])
+    options = PolishOptions(kernel=kernel)
+    adjustment = BundleAdjustment(
+        start, problem.observations, options, sigma=0.5, free_focal=True, lens_sigmas=sigmas
+    )  # fmt: skip
+    adjustment.state = replace(start, lens=start.lens + 0.01, log_focal=start.log_focal + 0.01)
+    normal = adjustment._linearize()
+    lens = 6 * problem.frames
+    assert len(normal.camera_gradient) == lens + 5
+
+    def slope(column):
+        costs = []
+        for sign in (1, -1):
+            camera = np.zeros(lens + 5)
+            camera[column] = sign * 1e-6
+            costs.append(adjustment._cost(adjustment._retract(camera, np.zeros((len(problem.points), 3)))))
+        return (costs[0] - costs[1]) / 2e-6
+
+    expected = [slope(column) for column in range(lens + 5)]
+    np.testing.assert_allclose(
+        normal.camera_gradient, expected, rtol=1e-5, atol=1e-5 * np.abs(expected).max()
+    )  # fmt: skip
+
+
+def test_a_new_focal_length_leaves_the_first_image_as_it_is():
+    truth = make_problem("truck", frames=3, points=30).truth
+    other = through(truth, 500.0)
+    points = np.arange(len(truth.bearing))
+    first = np.zeros_like(points), points
+    before, after = (s.camera_points(*first) for s in (truth, other))
+    focal = np.exp(truth.log_focal)
+    np.testing.assert_allclose(500.0 * after[:, :2] / after[:, 2:], focal * before[:, :2] / before[:, 2:], atol=1e-9)
+    np.testing.assert_allclose(other.inverse_distance / after[:, 2], truth.inverse_distance / before[:, 2])
+
+
+@pytest.mark.parametrize("guess", [0.6, 2.0])
+def test_the_focal_length_is_found_from_a_wrong_guess(guess):
+    problem = make_problem("arc", frames=8, points=200, parallax=0.3, noise_px=0.05)
+    result = estimated(problem, guess=guess)
+    error = result.lens.lens.focal / problem.focal - 1
+    assert result.lens.determined
+    assert 1e-7 < abs(error) < 0.03
+    assert 1e-5 < result.lens.focal_std < FOCAL_STD
+    assert not result.lens.lens.shape.any()
+
+
+def test_a_rotation_determines_the_focal_length():
+    result = estimated(make_problem("rotation", frames=8, points=200, parallax=0.0, noise_px=0.1))
+    assert result.motion.kind is ShotKind.ROTATION
+    assert result.lens.determined
+    assert result.lens.lens.focal == pytest.approx(make_problem("rotation").focal, rel=0.01)
+
+
+def test_the_standard_deviation_is_consistent_with_the_error():
+    results = []
+    for seed in range(6):
+        problem = make_problem("arc", frames=6, points=150, parallax=0.3, noise_px=0.05, seed=seed)
+        found = estimated(problem, guess=1.2, lens="focal").lens
+        assert found.determined
+        results.append(np.log(found.lens.focal / problem.focal) / found.focal_std)
+    assert 0.3 < np.sqrt(np.mean(np.square(results))) < 1.7
+
+
+@pytest.mark.parametrize(("motion", "parallax"), [("handheld", 0.004), ("dolly", 0.2)])
+def test_tiny_motion_or_none_but_along_the_view_axis_keeps_the_guess(motion, parallax):
+    problem = make_problem(motion, frames=8, points=150, parallax=parallax, noise_px=0.2)
+    result = estimated(problem, guess=1.2)
+    assert not result.lens.determined
+    assert np.exp(result.state.log_focal) == pytest.approx(1.2 * problem.focal)
+    assert result.lens.focal_std > FOCAL_STD
+
+
+@pytest.mark.parametrize("lens", ["distortion", "all"])
+def test_distortion_is_recovered_over_the_image(lens):
+    problem = make_problem("arc", frames=8, points=250, parallax=0.3, noise_px=0.05)
+    shape = BARREL if lens == "distortion" else BARREL + [0, 0, 0.01, -0.008]
+    found = estimated(problem, guess=1.2, shape=shape, lens=lens).lens
+    assert found.determined
+    assert (found.shape_std[:2] < 0.05).all()
+    xy = problem.observations.xy
+    truth = problem.focal * distort(xy, shape)[0]
+    off = np.linalg.norm(found.lens.focal * distort(xy, found.lens.shape)[0] - truth, axis=1)
+    assert 1e-4 < np.percentile(off, 99) < (0.5 if lens == "distortion" else 1.5)
+
+
+def test_a_camera_of_the_lens_sees_as_the_lens_does():
+    guess = guess_camera(960, 540)
+    shape = np.array([-0.1, 0.03, 0.01, -0.02])
+    camera = with_lens(guess, 800.0, shape)
+    assert camera.model_name == "RADIAL"
+    uv = np.array([[0.1, 0.2], [-0.4, 0.15]])
+    pixels = 800.0 * distort(uv, shape)[0] + [480 - PIXEL_CENTER, 270 - PIXEL_CENTER]
+    np.testing.assert_allclose(normalized_from_pixels(camera, pixels), uv, atol=1e-8)
+    np.testing.assert_allclose(lens_shape(camera), [-0.1, 0.03, 0, 0])
+
+
+def test_a_lens_that_cannot_be_estimated_is_refused():
+    fisheye = pycolmap.Camera(
+        camera_id=1, model="OPENCV_FISHEYE", width=64, height=64, params=[50, 50, 32, 32, 0, 0, 0, 0]
+    )
+    with pytest.raises(InputError, match="OPENCV_FISHEYE"):
+        lens_shape(fisheye)
+    with pytest.raises(InputError, match="unknown lens 'wide'"):
+        api.reconstruct([], lens="wide")
+
+
+def test_the_command_line_takes_what_is_free(capsys):
+    with pytest.raises(SystemExit):
+        main(["reconstruct", "shot.mp4", "--output", "out", "--lens", "wide"])
+    assert "--lens" in capsys.readouterr().err
