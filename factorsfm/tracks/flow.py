@@ -108,7 +108,8 @@ class FlowTracker:
 
     def drop(self, ids: NDArray[np.int64]) -> None:
         """End tracks that the mapper found to be outliers."""
-        self._keep(~np.isin(self._ids, ids))
+        if len(ids):
+            self._keep(~np.isin(self._ids, ids))
 
     @property
     def ended(self) -> NDArray[np.int64]:
