@@ -62,6 +62,7 @@ def test_reconstruct_writes_the_result(
         "depth_kind": None,
         "masks": None,
         "frames": None,
+        "lens": "auto",
         "preset": "default",
         "unordered": None,
         "work": None,

@@ -118,7 +118,7 @@ def test_the_standard_deviation_is_consistent_with_the_error():
     assert 0.3 < np.sqrt(np.mean(np.square(results))) < 1.7
 
 
-@pytest.mark.parametrize(("motion", "parallax"), [("handheld", 0.004), ("dolly", 0.2)])
+@pytest.mark.parametrize(("motion", "parallax"), [("truck", 0.004), ("dolly", 0.2)])
 def test_tiny_motion_or_none_but_along_the_view_axis_keeps_the_guess(motion, parallax):
     problem = make_problem(motion, frames=8, points=150, parallax=parallax, noise_px=0.2)
     result = estimated(problem, guess=1.2)
@@ -129,7 +129,7 @@ def test_tiny_motion_or_none_but_along_the_view_axis_keeps_the_guess(motion, par
 
 @pytest.mark.parametrize("lens", ["distortion", "all"])
 def test_distortion_is_recovered_over_the_image(lens):
-    problem = make_problem("arc", frames=8, points=250, parallax=0.3, noise_px=0.05)
+    problem = make_problem("arc", frames=8, points=250, parallax=0.3, noise_px=0.03)
     shape = BARREL if lens == "distortion" else BARREL + [0, 0, 0.01, -0.008]
     found = estimated(problem, guess=1.2, shape=shape, lens=lens).lens
     assert found.determined
