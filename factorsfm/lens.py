@@ -28,6 +28,7 @@ _TOLERANCE = 1e-5  # the focal length lies along a flat valley
 _DISTORTION_SIGMA = 0.1
 _CENTER_SIGMA = 0.02  # of the width
 _LARGEST_RATIO = 4.0  # of the focal length to its guess
+_MISFIT = 1.5  # of the standard deviation above which a solution is doubted
 _CELLS = (6, 4)  # across and down, in which the errors of tracks may be alike
 # Distortion is believed where noise hardly explains it, and where it is large: tracks that err together, of an actor
 # without a mask above all, look like a displacement of 2 thousandths of the width.
@@ -51,6 +52,8 @@ class LensEstimate:
         guess: with which the tracks were undistorted; lens: what the shot says, or the guess.
         focal_std: relative standard deviation of the estimated focal length, believed or not.
         shape_std: (4,) standard deviations of the shape, NaN where it stays as guessed.
+        misfit_px: standard deviation of the tracks where they fit no lens: what an estimate says is chance then;
+            0 where they do.
         determined: whether the focal length is an estimate, not the guess.
     """
 
@@ -58,6 +61,7 @@ class LensEstimate:
     lens: Lens
     focal_std: float
     shape_std: Array
+    misfit_px: float
     determined: bool
 
     def renormalize(self, observations: Observations) -> Observations:
@@ -132,14 +136,15 @@ def estimate_lens(adjustment: BundleAdjustment, guess: Lens, options: Options) -
             best, std = full, full_std
     lens = Lens(float(np.exp(best.state.log_focal)), best.state.lens)
     logger.info("focal length %.1f pixels within %.2f %%, guess %.1f", lens.focal, 100 * std[0], guess.focal)
-    if not std[0] < FOCAL_STD or not 1 / _LARGEST_RATIO < lens.focal / guess.focal < _LARGEST_RATIO:
-        return adjustment, LensEstimate(guess, guess, float(std[0]), np.full(4, np.nan), False)
+    misfit = best.sigma if best.sigma > _MISFIT * o.doubtful_px else 0.0
+    if misfit or not std[0] < FOCAL_STD or not 1 / _LARGEST_RATIO < lens.focal / guess.focal < _LARGEST_RATIO:
+        return adjustment, LensEstimate(guess, guess, float(std[0]), np.full(4, np.nan), misfit, False)
     state = best.state if moves else through(start, lens.focal)
     settled = BundleAdjustment(
         replace(state, lens=np.zeros(4)), best.observations, options.polish, sigma=best.sigma
     )  # fmt: skip
     settled.solve()
-    return settled, LensEstimate(guess, lens, float(std[0]), std[1:], True)
+    return settled, LensEstimate(guess, lens, float(std[0]), std[1:], 0.0, True)
 
 
 def search_focal(adjustment: BundleAdjustment, guess: Lens, options: PolishOptions) -> float:

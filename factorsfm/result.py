@@ -210,7 +210,10 @@ def _notes(polished: Polished, has_depth: bool) -> list[str]:
 def _lens_note(estimate: LensEstimate) -> str:
     focal, std = estimate.lens.focal, f"standard deviation {100 * estimate.focal_std:.1f} %"
     if not estimate.determined:
-        return f"The focal length is a guess ({focal:.0f} pixels): this shot does not determine it ({std})."
+        reason = f"this shot does not determine it ({std})"
+        if estimate.misfit_px:
+            reason = f"the tracks fit no lens (typical error {estimate.misfit_px:.2f} pixels)"
+        return f"The focal length is a guess ({focal:.0f} pixels): {reason}."
     note = f"The focal length was estimated: {focal:.0f} pixels, {std}"
     if np.isfinite(estimate.shape_std[0]):
         k, k_std = estimate.lens.shape, estimate.shape_std

@@ -127,6 +127,14 @@ def test_tiny_motion_or_none_but_along_the_view_axis_keeps_the_guess(motion, par
     assert result.lens.focal_std > FOCAL_STD
 
 
+def test_tracks_that_fit_no_lens_determine_none():
+    problem = make_problem("arc", frames=16, points=400, parallax=0.3, noise_px=0.8)
+    result = estimated(problem, guess=1.2, lens="focal")
+    assert not result.lens.determined
+    assert 0.6 < result.lens.misfit_px < 1.0
+    assert np.exp(result.state.log_focal) == pytest.approx(1.2 * problem.focal)
+
+
 @pytest.mark.parametrize("lens", ["distortion", "all"])
 def test_distortion_is_recovered_over_the_image(lens):
     problem = make_problem("arc", frames=8, points=250, parallax=0.3, noise_px=0.03)
