@@ -87,7 +87,12 @@ class Episode(Closing):
                 self._camera, depth=self._depth, masks=self._masks, options=self._options
             )
         stream = self._streams[self._shot]
-        update = stream.push(frame)
+        try:
+            update = stream.push(frame)
+        except Exception:
+            if not stream.frames:  # a shot begins with the first frame that is taken
+                self._streams.pop(self._shot).close()
+            raise
         if len(stream.frames) == _CERTAIN:
             for number in sorted(self._streams):
                 if number < self._shot:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from rendered import FRAMES, rendered, with_fewer_tracks
 
-from factorsfm import Episode, FrameStatus, Options, ShotKind
+from factorsfm import DepthKind, Episode, FrameStatus, ModelError, Options, ShotKind
 from factorsfm.episode import ShotResult
 from factorsfm.synthetic import render_shot
 
@@ -87,3 +87,14 @@ def test_errors_of_a_frame_leave_the_film_as_it_was():
 
 def test_no_frame_gives_no_shot():
     assert Episode().finish() == []
+
+
+def test_a_prior_that_fails_before_a_shot_has_begun_leaves_no_shot():
+    def fails(frame):
+        raise RuntimeError("no network")
+
+    fails.kind = DepthKind.INVERSE
+    episode = Episode(rendered("dolly").camera, depth=fails, options=OPTIONS)
+    with pytest.raises(ModelError, match="no network"):
+        episode.push(rendered("dolly").images[0])
+    assert episode.finish() == []
