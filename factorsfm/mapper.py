@@ -36,6 +36,7 @@ _DEPTH_PATIENCE = 3  # keyframes without a depth map after which one does withou
 _YOUNG_ERROR = 0.8  # relative, of a map that only the prior has shaped; falls with the square of the keyframes
 _LEAST_RELOCALIZED = 0.3  # of the similar corners must agree with the pose
 _RUNNING_OUT = 0.5  # share of an image's tracks with a point, below which the map is extended at once
+_CONSENSUS = 0.8  # share of the mapped tracks that is enough, however wide the threshold
 _LEAST_SHARED = 0.7  # of the tracks of the last keyframe; with fewer, a new one is made
 
 
@@ -248,7 +249,9 @@ class Mapper:
             depth_weight=o.depth_weight,
         )
         found = int(result.inliers.sum())
-        needed = math.ceil(o.min_inliers * result.threshold / o.inlier_px)  # more agree by chance within a wide one
+        # More agree by chance within a wide threshold, as its area grows.
+        by_chance = (result.threshold / o.inlier_px) ** 2
+        needed = math.ceil(min(o.min_inliers * by_chance, max(o.min_inliers, _CONSENSUS * mapped.sum())))
         if found < needed:
             image.status = FrameStatus.TOO_FEW_INLIERS
             within = f"within {result.threshold:.1f} pixels among {mapped.sum()} mapped tracks"
