@@ -123,7 +123,15 @@ def write_manifest(chosen: dict[str, list[Cell]], folders: Folders, output: Path
     """Which records make which experiment, beside the results; experiments that did not run now are kept."""
     output.mkdir(parents=True, exist_ok=True)
     path = output / MANIFEST
-    manifest = json.loads(path.read_text()) if path.is_file() else {}
+    known = json.loads(path.read_text()) if path.is_file() else {}
+    # The cache of another machine is not here: without its records, an experiment cannot be drawn beside the new ones.
+    manifest = {
+        name: facts
+        for name, facts in known.items()
+        if all((folders.cache / record).is_file() for record in facts["records"])
+    }
+    if left_out := sorted(known.keys() - manifest.keys()):
+        _say(f"Left out of the tables, since the cache lacks their records: {', '.join(left_out)}.")
     for name, cells in chosen.items():
         if cells:
             manifest[name] = {

@@ -260,6 +260,7 @@ def _solve_core(part: State, few: Observations, options: Options) -> BundleAdjus
     sigma = min(sigma, coordinate_sigma(adjustment.reprojection_errors()))
     adjustment = BundleAdjustment(adjustment.state, few, o, sigma=sigma)
     adjustment.solve()
+    adjustment.state = in_front(adjustment.state)
     logger.debug("cameras: %d iterations, %.3f px", adjustment.iterations, sigma)
     adjustment.sigma = coordinate_sigma(adjustment.reprojection_errors())
     return adjustment
@@ -274,6 +275,13 @@ def _flat(part: State, few: Observations, options: PolishOptions) -> State:
     )
     rotating = BundleAdjustment(still, few, replace(options, iterations=15), sigma=1.0, free_translation=False)
     return rotating.solve()
+
+
+def in_front(part: State) -> State:
+    """The scene before the cameras: with all inverse distances and translations negated, the images are the same."""
+    if float(np.median(part.inverse_distance)) >= 0.0:
+        return part
+    return replace(part, translation=-part.translation, inverse_distance=-part.inverse_distance)
 
 
 def _reversed(part: State) -> State:

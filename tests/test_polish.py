@@ -9,7 +9,7 @@ from estimation_problems import angles_between, in_unit_of, make_problem
 from factorsfm.images import MappedImage
 from factorsfm.initialization import ImageTracks
 from factorsfm.options import Options
-from factorsfm.polish import polish
+from factorsfm.polish import in_front, polish
 from factorsfm.reconstruction import FrameStatus, ShotKind
 
 
@@ -58,6 +58,17 @@ def test_the_truth_is_found_from_a_damaged_map(motion, damage):
     assert 1e-5 * path < error < 0.1 * path
     assert 0.05 < result.sigma < 0.15
     assert len(result.tracks) > 0.9 * len(start.bearing)
+
+
+def test_a_scene_behind_the_cameras_is_put_before_them():
+    truth = make_problem("truck", frames=4, points=30).truth
+    behind = replace(truth, translation=-truth.translation, inverse_distance=-truth.inverse_distance)
+    frame, point = (index.ravel() for index in np.indices((4, 30)))
+    np.testing.assert_allclose(behind.camera_points(frame, point), truth.camera_points(frame, point))  # as good a fit
+    for state in (truth, behind):
+        found = in_front(state)
+        np.testing.assert_array_equal(found.translation, truth.translation)
+        np.testing.assert_array_equal(found.inverse_distance, truth.inverse_distance)
 
 
 def test_a_long_shot_registers_the_frames_between_on_the_polished_points():
