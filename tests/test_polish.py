@@ -63,7 +63,7 @@ def test_the_truth_is_found_from_a_damaged_map(motion, damage):
 def test_a_scene_behind_the_cameras_is_put_before_them():
     truth = make_problem("truck", frames=4, points=30).truth
     behind = replace(truth, translation=-truth.translation, inverse_distance=-truth.inverse_distance)
-    frame, point = (index.ravel() for index in np.indices((4, 30)))
+    frame, point = (index.ravel() for index in np.indices((4, len(truth.bearing))))
     np.testing.assert_allclose(behind.camera_points(frame, point), truth.camera_points(frame, point))  # as good a fit
     for state in (truth, behind):
         found = in_front(state)
