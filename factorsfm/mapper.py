@@ -36,6 +36,7 @@ _DEPTH_PATIENCE = 3  # keyframes without a depth map after which one does withou
 _YOUNG_ERROR = 0.8  # relative, of a map that only the prior has shaped; falls with the square of the keyframes
 _LEAST_RELOCALIZED = 0.3  # of the similar corners must agree with the pose
 _RUNNING_OUT = 0.5  # share of an image's tracks with a point, below which the map is extended at once
+_SUDDEN = 0.3  # share of the inliers of the image before that remain within a wide threshold
 _CONSENSUS = 0.8  # share of the mapped tracks that is enough, however wide the threshold
 _LEAST_SHARED = 0.7  # of the tracks of the last keyframe; with fewer, a new one is made
 
@@ -252,6 +253,8 @@ class Mapper:
         # More agree by chance within a wide threshold, as its area grows.
         by_chance = (result.threshold / o.inlier_px) ** 2
         needed = math.ceil(min(o.min_inliers * by_chance, max(o.min_inliers, _CONSENSUS * mapped.sum())))
+        if by_chance > 1.0:  # few of many, all at once, and those only roughly: what is seen is something else
+            needed = max(needed, math.ceil(_SUDDEN * near.inliers))
         if found < needed:
             image.status = FrameStatus.TOO_FEW_INLIERS
             within = f"within {result.threshold:.1f} pixels among {mapped.sum()} mapped tracks"
