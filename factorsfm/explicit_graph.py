@@ -14,7 +14,7 @@ from factorsfm.factors import (
     pose_from_camera,
     virtual_offset,
 )
-from factorsfm.noise import SMALLEST_SIGMA_PX, typical_sigma
+from factorsfm.noise import coordinate_sigma
 from factorsfm.options import PolishOptions
 from factorsfm.reconstruction import Reconstruction, ShotKind
 from factorsfm.registration import SCALE_SIGMA, SHIFT_SIGMA
@@ -50,7 +50,7 @@ def factor_graph(reconstruction: Reconstruction) -> tuple[gtsam.NonlinearFactorG
     rows = np.flatnonzero(np.isin(r.observation_frame, list(poses)))
     frame_of, point_of = r.observation_frame[rows], r.observation_point[rows]
     focal = r.camera.mean_focal_length()
-    sigma = max(typical_sigma(r.observation_error[rows]), SMALLEST_SIGMA_PX)
+    sigma = coordinate_sigma(r.observation_error[rows])
     lens, pixel = gtsam.Cal3_S2(focal, focal, 0, 0, 0), noise.Robust.Create(kernel, noise.Isotropic.Sigma(2, sigma))
     pixels = focal * normalized_from_pixels(r.camera, r.observation_xy[rows])
     for i, j, xy in zip(frame_of.tolist(), point_of.tolist(), pixels, strict=True):

@@ -10,7 +10,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from factorsfm.factors import distort
-from factorsfm.noise import block_inflation, coordinate_sigma
+from factorsfm.noise import block_inflation, coordinate_sigma, image_cells
 from factorsfm.observability import classify_motion
 from factorsfm.options import FOCAL_STD, Options, PolishOptions
 from factorsfm.problem import Observations, State
@@ -246,9 +246,7 @@ def _pulled_covariance(adjustment: BundleAdjustment, columns: Index) -> Array:
     """Covariance from how differently the parts of the image pull at some columns."""
     o, influence = adjustment.observations, adjustment.influences(columns)
     xy = np.stack([np.bincount(o.point, o.xy[:, i]) for i in range(2)], -1) / np.bincount(o.point)[:, None]
-    low, high = xy.min(0), xy.max(0)
-    cell = (0.999 * (xy - low) / np.maximum(high - low, 1e-9) * _CELLS).astype(np.int64)
-    used, key = np.unique(cell[:, 1] * _CELLS[0] + cell[:, 0], return_inverse=True)
+    used, key = np.unique(image_cells(xy, *_CELLS), return_inverse=True)
     pull = np.stack([np.bincount(key, part) for part in influence.T], -1)
     return np.asarray(pull.T @ pull * (len(used) / max(len(used) - 1, 1)))
 

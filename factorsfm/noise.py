@@ -52,13 +52,19 @@ def block_inflation(residual: Array, observations: Observations) -> float:
         residual: (m, 2) predicted minus observed position of each observation.
     """
     o, inlier = observations, _inliers(residual)
-    low, high = o.xy.min(0), o.xy.max(0)
-    cell = (0.999 * (o.xy - low) / np.maximum(high - low, 1e-9) * _BLOCKS[:2]).astype(np.int64)
-    key = ((o.frame // _BLOCKS[2]) * _BLOCKS[1] + cell[:, 1]) * _BLOCKS[0] + cell[:, 0]
+    across, down, frames = _BLOCKS
+    key = (o.frame // frames) * down * across + image_cells(o.xy, across, down)
     key, residual = key[inlier], residual[inlier]
     sums = [np.bincount(key, residual[:, axis]) for axis in range(2)]
     power = float((residual**2).sum())
     return max(1.0, float((sums[0] ** 2 + sums[1] ** 2).sum()) / max(power, 1e-12))
+
+
+def image_cells(xy: Array, across: int, down: int) -> NDArray[np.int64]:
+    """(n,) cell of each position (n, 2) in a grid over what they fill, numbered row by row."""
+    low, high = xy.min(0), xy.max(0)
+    cell = (0.999 * (xy - low) / np.maximum(high - low, 1e-9) * [across, down]).astype(np.int64)
+    return np.asarray(cell[:, 1] * across + cell[:, 0])
 
 
 def _inliers(residual: Array) -> NDArray[np.bool_]:

@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-
-import cv2
-from threadpoolctl import threadpool_limits
+from collections.abc import Callable
+from contextlib import nullcontext
 
 from factorsfm import api
 from factorsfm.batch.plan import Job, Video, shots_of
 from factorsfm.errors import FactorsfmError, ReconstructionError
 from factorsfm.export.folder import write_failure, write_folder
+from factorsfm.threads import OneThreadEach
 
 Progress = Callable[[str, int, int | None], None]
 
 
 def find_shots_of(video: Video, *, one_thread: bool) -> list[range]:
     """Shots of a video; errors as in `plan.shots_of`."""
-    with _threads(one_thread):
+    with OneThreadEach() if one_thread else nullcontext():
         return shots_of(video)
 
 
@@ -35,7 +33,8 @@ def reconstruct_shot(job: Job, *, one_thread: bool, progress: Progress | None = 
     begin = time.perf_counter()
     method = job.method
     try:
-        with _threads(one_thread):
+        # A network opened inside keeps to one thread, too, see `priors.networks`.
+        with OneThreadEach() if one_thread else nullcontext():
             reconstruction = api.reconstruct(
                 job.video.path,
                 camera=method.camera,
@@ -54,18 +53,3 @@ def reconstruct_shot(job: Job, *, one_thread: bool, progress: Progress | None = 
         return
     reconstruction.options["job"] = job.to_dict()
     write_folder(reconstruction, job.folder)
-
-
-@contextmanager
-def _threads(one: bool) -> Iterator[None]:
-    """Libraries with one thread each, or as they are."""
-    if not one:
-        yield
-        return
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(1)  # onnxruntime follows it, see `priors.networks`
-    try:
-        with threadpool_limits(1):
-            yield
-    finally:
-        cv2.setNumThreads(before)
