@@ -40,24 +40,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s", handlers=[_LogHandler(progress)])
     try:
         with progress:
-            if arguments.command == "demo":
-                _demo(arguments, progress)
-            elif arguments.command == "export":
-                print(export_command.run(arguments))
-            elif arguments.command == "stream":
-                said = stream_command.run(arguments, progress, progress.show)
-                progress.clear()
-                print(said)
-            elif arguments.command == "batch":
-                said = batch_command.run(arguments, progress, progress.show)
-                progress.clear()
-                print(said)
-            elif arguments.command == "overlay":
-                sentence = overlay_command.run(arguments, progress)
-                progress.clear()
-                print(sentence)
-            else:
-                _reconstruct(arguments, progress)
+            said = _run(arguments, progress)
+            progress.clear()
+            print(said)
     except ReconstructionError as error:
         return _complain(f"error: {error}", NOT_RECONSTRUCTED)
     except FactorsfmError as error:
@@ -67,7 +52,24 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _reconstruct(arguments: argparse.Namespace, progress: _Progress) -> None:
+def _run(arguments: argparse.Namespace, progress: _Progress) -> str:
+    """Run the command that was asked for; what to say of it."""
+    match arguments.command:
+        case "demo":
+            return _demo(arguments, progress)
+        case "export":
+            return export_command.run(arguments)
+        case "stream":
+            return stream_command.run(arguments, progress, progress.show)
+        case "batch":
+            return batch_command.run(arguments, progress, progress.show)
+        case "overlay":
+            return overlay_command.run(arguments, progress)
+        case _:
+            return _reconstruct(arguments, progress)
+
+
+def _reconstruct(arguments: argparse.Namespace, progress: _Progress) -> str:
     check_directory(arguments.output)
     camera = read_camera(arguments.camera) if arguments.camera else None
     frames = parse_range(arguments.frames) if arguments.frames else None
@@ -93,15 +95,12 @@ def _reconstruct(arguments: argparse.Namespace, progress: _Progress) -> None:
         raise
     progress("writing", 0, None)
     write_folder(reconstruction, arguments.output)
-    progress.clear()
-    print(conclusion(reconstruction, arguments.output))
+    return conclusion(reconstruction, arguments.output)
 
 
-def _demo(arguments: argparse.Namespace, progress: _Progress) -> None:
+def _demo(arguments: argparse.Namespace, progress: _Progress) -> str:
     result = demo.run_demo(arguments.output, progress)
-    progress.clear()
-    print(conclusion(result.reconstruction, arguments.output))
-    print(result.comparison())
+    return f"{conclusion(result.reconstruction, arguments.output)}\n{result.comparison()}"
 
 
 def _complain(message: str, status: int) -> int:

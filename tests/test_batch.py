@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import pytest
 from chromium import EXECUTABLE, MISSING, Chromium
+from command_line import assert_error, trajectory
 from rendered import FRAMES, quick_presets, rendered
 
 from factorsfm.batch.crew import WorkerLostError, open_crew
@@ -72,20 +73,8 @@ def index(folder: Path) -> dict[str, Any]:
     return content
 
 
-def trajectory(folder: Path) -> np.ndarray:
-    return np.loadtxt(folder / "trajectory.tum")
-
-
 def written(output: Path) -> dict[Path, int]:
     return {path: path.stat().st_mtime_ns for path in output.rglob("summary.json")}
-
-
-def assert_error(captured: Any, *words: str) -> None:
-    assert captured.out == ""
-    (line,) = captured.err.strip().splitlines()
-    assert line.startswith("factorsfm: error: ")
-    for word in words:
-        assert word in line
 
 
 def test_every_shot_has_its_result_and_the_bad_one_its_sentence(

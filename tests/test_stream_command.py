@@ -8,11 +8,11 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from command_line import assert_error, trajectory
 from rendered import FRAMES, quick_presets, rendered, simulated_maps
 
 import factorsfm
@@ -56,18 +56,6 @@ def stream(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: list[str]) ->
 
 def summary(folder: Path) -> dict:
     return json.loads((folder / "summary.json").read_text())
-
-
-def trajectory(folder: Path) -> np.ndarray:
-    return np.loadtxt(folder / "trajectory.tum")
-
-
-def assert_error(captured: Any, *words: str) -> None:
-    assert captured.out == ""
-    (line,) = captured.err.strip().splitlines()
-    assert line.startswith("factorsfm: error: ")
-    for word in words:
-        assert word in line
 
 
 def test_a_stream_gives_the_result_of_the_one_call(
