@@ -18,15 +18,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.options import TrackerOptions
+from factorsfm.tracks.local_motion import LocalMotion
 from factorsfm.tracks.patches import Array, BirthPatches, Image, in_parts
 
-_STATE = ("_texture", "_frame", "_replenished", "_next_id", "_ids", "_xy", "_born_at", "_velocity", "_ended")
+_STATE = ("_texture", "_frame", "_replenished", "_next_id", "_ids", "_xy", "_velocity", "_ended")
 BLANK_TEXTURE = 0.2  # grey levels
 _MOST_ENDED = 3000  # tracks that are remembered
 _REVIVAL_REACH = 2.0  # times that of a re-alignment: where a track should be is known less well
 _SCOUTS = 64  # tracks that tell how the camera's motion has changed
+_FIT_STEPS, _FIT_RIDGE = 5, 1e-4
 _SURPRISE_PX, _SURPRISE_RATIO = 0.5, 3.0  # distance from the predicted place; and times that of the others
-_GRID = 24  # cells along the longer image side in which the local motion is estimated
+_GRID = 24  # cells along the longer image side, from which new corners are taken in turn
 _CHECK_INTERVAL = 2  # frames: the way back of an alignment is tried in turn
 _REPLENISH_INTERVAL, _FEW = 3, 0.7  # frames between looking for corners, unless so small a share of the tracks is left
 _BLANK_SHARE = 0.2  # of the texture of the last frame; with less, a frame among others is black or a flash
@@ -68,8 +70,8 @@ class FlowTracker:
         self._next_id = 0
         self._ids = np.zeros(0, np.int64)
         self._xy = np.zeros((0, 2), np.float32)
-        self._born_at = np.zeros(0, np.int64)
         self._velocity = np.zeros((0, 2), np.float32)
+        self._motion: LocalMotion | None = None  # into the present frame
         self._patches = BirthPatches(options.window_px)
         self._window = (options.window_px, options.window_px)
         self._just_ended: list[tuple[NDArray[np.int64], BirthPatches]] = []
@@ -101,7 +103,7 @@ class FlowTracker:
         lost = before - len(self._ids)
         if expected is not None:
             self.revive(grey, *expected)
-        born = self._replenish(grey, mask)
+        born = self._replenish(frame, mask)
         self._previous, self._texture = frame, texture
         self._frame += 1
         return TrackedFrame(self._ids.copy(), self._xy.astype(np.float64), lost, born, texture)
@@ -143,8 +145,7 @@ class FlowTracker:
         revived = self._ended[rows]
         self._ids = np.r_[self._ids, revived]
         self._xy = np.r_[self._xy, found]
-        self._velocity = np.r_[self._velocity, np.zeros_like(found)]
-        self._born_at = np.r_[self._born_at, np.full(len(rows), -1)]  # long ago
+        self._velocity = np.r_[self._velocity, self._usual_velocity(found)]
         self._patches.append(self._ended_patches.take(rows))
         self._keep(np.argsort(self._ids))
         rest = np.ones(len(self._ended), bool)
@@ -187,53 +188,53 @@ class FlowTracker:
     def _keep(self, index: NDArray[np.bool_] | NDArray[np.intp]) -> None:
         self._ids = self._ids[index]
         self._xy = self._xy[index]
-        self._born_at = self._born_at[index]
         self._velocity = self._velocity[index]
         self._patches.keep(index)
 
     def _step(self, previous: _Frame, frame: _Frame, mask: NDArray[np.bool_] | None) -> None:
         """Align the patches where their tracks should be; search in the frame before for those that are not there."""
         o, old, n, grey = self.options, self._xy, len(self._ids), frame.full
-        settled = np.nonzero(self._born_at < self._frame - 1)[0]
-        new, ok = old.copy(), np.zeros(n, bool)
-        if len(settled):
-            start = self._predicted(previous, frame, settled)
-            checked = (self._ids[settled] + self._frame) % _CHECK_INTERVAL == 0
-            new[settled], ok[settled] = self._patches.align(
-                grey, settled, start, o.realign_check_px, o.realign_reach_px, self._pool, checked
-            )
-            surprise = np.linalg.norm(new[settled] - start, axis=1)
-            if ok.any():
-                ok[settled] &= surprise < max(_SURPRISE_PX, _SURPRISE_RATIO * np.median(surprise[ok[settled]]))
+        start = self._predicted(previous, frame)
+        checked = (self._ids + self._frame) % _CHECK_INTERVAL == 0
+        new, ok = self._patches.align(
+            grey, np.arange(n), start, o.realign_check_px, o.realign_reach_px, self._pool, checked
+        )
+        surprise = np.linalg.norm(new - start, axis=1)
+        if ok.any():
+            ok &= surprise < max(_SURPRISE_PX, _SURPRISE_RATIO * np.median(surprise[ok]))
         search = np.nonzero(~ok)[0]
         new[search], ok[search] = self._search(previous, frame, old[search])
-        linear = np.empty((n, 2, 2), np.float32)
-        linear[ok] = _local_affine(old[ok], new[ok], grey.shape)
-        linear[~ok] = np.eye(2)
+        self._motion = LocalMotion(old[ok], new[ok], grey.shape)
+        linear = np.tile(np.eye(2, dtype=np.float32), (n, 1, 1))
+        linear[ok] = self._motion.linear(old[ok])
         self._patches.move(linear)
-        again = np.intersect1d(search[ok[search]], settled)
+        again = search[ok[search]]
         if len(again):
             new[again], ok[again] = self._patches.align(
-                grey, again, new[again], self.options.realign_check_px, self.options.realign_reach_px, self._pool
+                grey, again, new[again], o.realign_check_px, o.realign_reach_px, self._pool
             )
-        ok &= _inside(new, grey.shape, self.options.border_px)
+        ok &= _inside(new, grey.shape, o.border_px)
         if mask is not None:
             ok &= ~_at(mask, new)
         self._xy, self._velocity = new, new - old
         self._end(np.nonzero(~ok)[0])
         self._keep(np.nonzero(ok)[0])
 
-    def _predicted(self, previous: _Frame, frame: _Frame, rows: NDArray[np.intp]) -> Array:
+    def _usual_velocity(self, xy: Array) -> Array:
+        """How fast points should be that were not followed into this frame: as fast as their neighbours."""
+        return np.zeros_like(xy) if self._motion is None else self._motion.at(xy)
+
+    def _predicted(self, previous: _Frame, frame: _Frame) -> Array:
         """Where tracks should be: as fast as before, and with the camera's change of motion, which a few tell."""
-        predicted = self._xy[rows] + self._velocity[rows]
-        scouts = np.linspace(0, len(rows) - 1, min(len(rows), _SCOUTS)).astype(int)
-        found, seen = self._roughly(previous, frame, self._xy[rows[scouts]])
-        if seen.sum() < 8:
-            return predicted
-        change, _ = cv2.estimateAffinePartial2D(predicted[scouts[seen]], found[seen], ransacReprojThreshold=1.0)
-        if change is None:
-            return predicted
-        return np.asarray((predicted @ change[:, :2].T + change[:, 2]).astype(np.float32), np.float32)
+        predicted = self._xy + self._velocity
+        scouts = np.linspace(0, len(predicted) - 1, min(len(predicted), _SCOUTS)).astype(int)
+        found, seen = self._roughly(previous, frame, self._xy[scouts])
+        scouts = scouts[seen]
+        # Affine in the image as a rotation is nearly, and in the motion before, in which parallax shows.
+        scale = np.array([1.0, *([1.0 / max(frame.full.shape)] * 4)])
+        cause = np.column_stack([np.ones(len(predicted)), self._xy, self._velocity]) * scale
+        change = _robust_fit(cause[scouts], found[seen] - predicted[scouts])
+        return np.asarray(predicted + cause @ change, np.float32)
 
     def _roughly(self, previous: _Frame, frame: _Frame, xy: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Flow of points in the images of half the size, whatever the motion; and where there is any."""
@@ -263,7 +264,7 @@ class FlowTracker:
 
         return in_parts(part, len(xy), len(xy), self._pool) if len(xy) else (xy, np.zeros(0, bool))
 
-    def _replenish(self, grey: NDArray[np.uint8], mask: NDArray[np.bool_] | None) -> int:
+    def _replenish(self, frame: _Frame, mask: NDArray[np.bool_] | None) -> int:
         """Start tracks where the image is not covered, strongest corners first in every cell."""
         o = self.options
         room = o.max_tracks - len(self._ids)
@@ -272,30 +273,49 @@ class FlowTracker:
         if len(self._ids) > _FEW * o.max_tracks and self._frame - self._replenished < _REPLENISH_INTERVAL:
             return 0
         self._replenished = self._frame
-        h, w = grey.shape
+        # Corners are sought in the image of half the size: where exactly a patch lies does not matter.
+        h, w = frame.half.shape
+        border = -(-o.border_px // 2)
         free = np.zeros((h, w), np.uint8)
-        free[o.border_px : h - o.border_px, o.border_px : w - o.border_px] = 255
+        free[border : h - border, border : w - border] = 255
         if mask is not None:
-            free[mask] = 0
-        radius = max(4, round(0.4 * (w * h / o.max_tracks) ** 0.5))
-        for x, y in self._xy.round().astype(int):
-            cv2.circle(free, (int(x), int(y)), radius, 0, -1)
-        corners = cv2.goodFeaturesToTrack(grey, 0, o.corner_quality, radius, mask=free, blockSize=5)
+            free[mask[: 2 * h : 2, : 2 * w : 2] | mask[1 : 2 * h : 2, 1 : 2 * w : 2]] = 0
+        radius = max(2, round(0.4 * (w * h / o.max_tracks) ** 0.5))
+        for x, y in (0.5 * self._xy - 0.25).round().astype(int).tolist():
+            cv2.circle(free, (x, y), radius, 0, -1)
+        corners = cv2.goodFeaturesToTrack(frame.half, 0, o.corner_quality, radius, mask=free, blockSize=3)
         if corners is None:
             return 0
-        corners = _spread(corners[:, 0], room, grey.shape)
+        corners = _spread(2.0 * np.rint(corners[:, 0]), room, frame.full.shape)
         m = len(corners)
         self._ids = np.r_[self._ids, np.arange(self._next_id, self._next_id + m)]
         self._next_id += m
         self._xy = np.r_[self._xy, corners].astype(np.float32)
-        self._born_at = np.r_[self._born_at, np.full(m, self._frame)]
-        self._velocity = np.r_[self._velocity, np.zeros((m, 2), np.float32)]
-        self._patches.add(grey, corners)
+        self._velocity = np.r_[self._velocity, self._usual_velocity(corners)]
+        self._patches.add(frame.full, corners)
         return m
 
 
 _STOP = cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS
 _COARSE = (_STOP, 12, 0.02)  # from frame to frame: the re-alignment does the rest
+
+
+def _robust_fit(cause: NDArray[np.float64], effect: Array) -> NDArray[np.float64]:
+    """(c, 2) coefficients with ``cause @ coefficients ~ effect`` where most rows agree; zero where hardly any is there.
+
+    Args:
+        cause: (n, c) of size one; effect: (n, 2) pixels.
+    """
+    rows, columns = cause.shape
+    solution: NDArray[np.float64] = np.zeros((columns, 2))
+    weight = np.ones(rows)
+    for _ in range(_FIT_STEPS if rows >= 2 * columns else 0):
+        weighted = cause * weight[:, None]
+        normal = weighted.T @ cause + _FIT_RIDGE * np.eye(columns)
+        solution = np.asarray(np.linalg.solve(normal, weighted.T @ effect), np.float64)
+        error = np.linalg.norm(cause @ solution - effect, axis=1)
+        weight = 1.0 / (1.0 + (error / max(float(np.median(error)), _SURPRISE_PX)) ** 2)
+    return solution
 
 
 def _halved(grey: Image) -> Image:
@@ -341,34 +361,3 @@ def _spread(corners: Array, count: int, shape: tuple[int, ...]) -> Array:
     turn = np.empty(len(key), int)
     turn[order] = rank
     return corners[np.argsort(turn, kind="stable")[:count]]
-
-
-def _local_affine(old: Array, new: Array, shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """(n, 2, 2) linear part of the local motion old -> new: weighted regression on a grid of moments."""
-    if not len(old):
-        return np.zeros((0, 2, 2), np.float32)
-    h, w = shape[:2]
-    cell = max(h, w) / _GRID
-    gw, gh = int(np.ceil(w / cell)), int(np.ceil(h / cell))
-    p = old.astype(np.float64)
-    u = (new - old).astype(np.float64)
-    ij = np.minimum((p / cell).astype(int), [gw - 1, gh - 1])
-    index = ij[:, 1] * gw + ij[:, 0]
-    x, y = (p / cell).T
-    columns = [np.ones_like(x), x, y, x * x, x * y, y * y]
-    columns += [u[:, 0], u[:, 0] * x, u[:, 0] * y, u[:, 1], u[:, 1] * x, u[:, 1] * y]
-    grid = np.stack([np.bincount(index, c, gw * gh) for c in columns], -1).reshape(gh, gw, -1)
-    grid = cv2.GaussianBlur(grid, (0, 0), 1.5, borderType=cv2.BORDER_CONSTANT).reshape(gh * gw, -1)
-    s1, sx, sy, sxx, sxy, syy, u0, u0x, u0y, v0, v0x, v0y = grid.T
-    s1 = np.maximum(s1, 1e-12)
-    mx, my = sx / s1, sy / s1
-    cxx, cxy, cyy = sxx / s1 - mx * mx, sxy / s1 - mx * my, syy / s1 - my * my
-    ridge = 0.3 / s1  # a cell with few tracks falls back to pure translation
-    cxx, cyy = cxx + ridge, cyy + ridge
-    det = cxx * cyy - cxy * cxy
-    linear = np.empty((gh * gw, 2, 2))
-    for row, (m0, m0x, m0y) in enumerate(((u0, u0x, u0y), (v0, v0x, v0y))):
-        bx, by = m0x / s1 - m0 / s1 * mx, m0y / s1 - m0 / s1 * my
-        linear[:, row, 0] = (cyy * bx - cxy * by) / det / cell
-        linear[:, row, 1] = (cxx * by - cxy * bx) / det / cell
-    return np.asarray(np.eye(2) + linear[index], np.float32)

@@ -166,19 +166,19 @@ def _warped(patches: Image, affine: Array, half: int) -> Image:
     n, side, _ = patches.shape
     tile = 2 * half + 1
     offset = np.arange(-half, half + 1, dtype=np.float32)
-    grid = np.stack([np.tile(offset, tile), np.repeat(offset, tile)])
-    maps = np.linalg.inv(affine) @ grid  # (n, 2, tile * tile)
-    maps += np.float32(_SUPPORT)
+    grid = np.stack([np.tile(offset, tile), np.repeat(offset, tile), np.full(tile * tile, _SUPPORT, np.float32)])
+    back = np.concatenate([np.linalg.inv(affine), np.ones((n, 2, 1), np.float32)], 2)
+    # One product for all patches: a small one for each would cost as much as the interpolation.
+    maps = (back.transpose(1, 0, 2).reshape(2 * n, 3) @ grid).reshape(2, n, tile * tile)
     np.clip(maps, 0, side - 1, out=maps)
     per_call = 30000 // side  # remap reads images of fewer than 32,768 rows
-    first = np.arange(n) % per_call * side
-    maps[:, 1] += first[:, None]
+    maps[1] += (np.arange(n, dtype=np.float32) % per_call * side)[:, None]
     out = np.empty((n, tile, tile), np.uint8)
     for i in range(0, n, per_call):
         part = slice(i, i + per_call)
         out[part] = cv2.remap(
-            patches[part].reshape(-1, side), maps[part, 0].reshape(-1, tile), maps[part, 1].reshape(-1, tile),
-            cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE,
+            patches[part].reshape(-1, side), maps[0, part], maps[1, part], cv2.INTER_CUBIC,
+            borderMode=cv2.BORDER_REPLICATE,
         ).reshape(-1, tile, tile)  # fmt: skip
     return out
 
