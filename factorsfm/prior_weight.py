@@ -28,7 +28,7 @@ _LOCAL = np.geomspace(0.05, 0.8, 7)
 _USUAL_SMOOTH, _USUAL_LOCAL, _USUAL_FACTOR = 0.4, 0.15, 2.0
 _LENGTHS = (0.15, 0.5)  # candidate correlation lengths, in units of the extent of the scene's directions
 _SAMPLE = 200  # points on which the likelihood is evaluated
-_NODES = (12, 7)  # nodes of the field across and down
+_NODES = (8, 5)  # nodes of the field across and down
 
 
 @dataclass(frozen=True, slots=True)
