@@ -94,9 +94,9 @@ class Elimination:
                 order = np.argsort(t.frame, kind="stable")
                 groups = []
                 for rows in np.split(order, np.nonzero(np.diff(t.frame[order]))[0] + 1):
-                    columns, local = np.unique(t.columns[rows], return_inverse=True)
-                    local = local.reshape(len(rows), -1)
-                    groups.append((rows, columns, local[:1] if (local == local[:1]).all() else local))
+                    mine = t.columns[rows]
+                    columns, local = self._occurring(mine[:1] if (mine == mine[:1]).all() else mine)
+                    groups.append((rows, columns, local[0]))
                 self._groups.append(groups)
         return self._groups
 
@@ -108,14 +108,21 @@ class Elimination:
             for begin in range(0, n, _CHUNK):
                 end = min(n, begin + _CHUNK)
                 rows = [slice(*np.searchsorted(t.point, [begin, end])) for t in terms]
-                columns = np.unique(np.concatenate([t.columns[r].ravel() for t, r in zip(terms, rows, strict=True)]))
+                columns, locals_ = self._occurring(*(t.columns[r] for t, r in zip(terms, rows, strict=True)))
                 flat = []
-                for t, r in zip(terms, rows, strict=True):
-                    local = np.searchsorted(columns, t.columns[r])
+                for t, r, local in zip(terms, rows, locals_, strict=True):
                     position = local.T[:, None] * 3 * (end - begin) + 3 * (t.point[r] - begin)
                     flat.append((position + np.arange(3)[:, None]).ravel())
                 self._chunks.append((flat, columns, slice(begin, end)))
         return self._chunks
+
+    def _occurring(self, *columns: Index) -> tuple[Index, list[Index]]:
+        """The columns that occur (ascending), and where among them each of the given ones is."""
+        occurs = np.zeros(self._columns, bool)
+        for some in columns:
+            occurs[some] = True
+        place = np.cumsum(occurs) - 1
+        return np.flatnonzero(occurs), [place[some] for some in columns]
 
     def cross_blocks(self, normal: Normal) -> list[Block]:
         """Camera-point blocks of the information matrix, dense over the columns of each chunk."""

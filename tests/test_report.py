@@ -196,7 +196,7 @@ def test_thumbnails_are_small_pictures_in_bounded_memory() -> None:
     kept = thumbnails.by_frame()
     assert [k for k, jpeg in enumerate(kept) if jpeg] == list(range(0, 45, 8))
     picture = cv2.imdecode(np.frombuffer(kept[16] or b"", np.uint8), cv2.IMREAD_COLOR)
-    assert picture.shape == (135, 240, 3)  # whole pixels are averaged, at most 384 remain across
+    assert picture.shape == (216, 384, 3)
     np.testing.assert_allclose(picture, 80, atol=3)
     small = Thumbnails()
     small.add(np.zeros((36, 64, 3), np.uint8))

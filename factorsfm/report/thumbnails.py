@@ -62,10 +62,13 @@ class Thumbnails:
 
 
 def thumbnail(image: NDArray[np.uint8]) -> bytes:
-    """A JPEG at most 384 pixels wide: whole pixels are averaged, which is several times as fast as other ratios."""
-    height, width = image.shape[:2]
-    if (block := -(-width // _WIDTH)) > 1:
-        size = width // block, max(1, height // block)
-        image = np.asarray(cv2.resize(image[: size[1] * block, : size[0] * block], size, interpolation=cv2.INTER_AREA))
+    """A JPEG at most 384 pixels wide: halved as often as that takes, which is fast, and brought to size."""
+    while image.shape[1] >= 2 * _WIDTH:
+        height, width = max(1, image.shape[0] // 2), image.shape[1] // 2
+        even = image[: 2 * height, : 2 * width]
+        image = np.asarray(cv2.resize(even, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+    if image.shape[1] > _WIDTH:
+        size = _WIDTH, max(1, round(image.shape[0] * _WIDTH / image.shape[1]))
+        image = np.asarray(cv2.resize(image, size), np.uint8)
     _, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
     return jpeg.tobytes()

@@ -18,7 +18,7 @@ _SUPPORT = 22  # half side of a stored patch: the window at half the birth's sca
 _MARGIN = 1  # of a warped patch around the window: interpolation and derivative
 _STALE_PX = 0.05  # change of the map at the edge of the window with which a patch is warped again
 _STOP = cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS
-_FINE = (_STOP, 20, 0.003)
+_FINE = (_STOP, 20, 0.01)
 _ALL_GOOD = 0.7  # share of the checked ones that must come back, or the others are checked, too
 _BACK = (_STOP, 5, 0.03)  # the way back only has to tell whether it ends where it began
 
