@@ -145,7 +145,7 @@ def reduced(normal: Normal, blocks: list[Block], damping: float) -> tuple[Array,
     diagonal = np.einsum("nii->ni", point)
     diagonal += damping * diagonal + 1e-12
     point_covariance = np.asarray(np.linalg.inv(point), np.float64)
-    root = np.linalg.cholesky(point_covariance)
+    root = np.asarray(np.linalg.cholesky(point_covariance), np.float64)
     information = normal.camera.copy()
     information[np.diag_indices_from(information)] *= 1.0 + damping
     gradient = normal.camera_gradient.copy()

@@ -38,6 +38,7 @@ class MappedImage:
     """An image and what is known of its pose.
 
     Attributes:
+        inliers: tracks that agree with its pose; threshold: reprojection error up to which they do (pixels).
         affine: scale and shift of its depth prior beside the map.
         covariance: (6, 6) of the pose as it was registered, or as the graph has it for a keyframe.
     """
@@ -49,6 +50,7 @@ class MappedImage:
     translation: Array | None = None
     keyframe: bool = False
     inliers: int = 0
+    threshold: float = 0.0
     affine: tuple[float, float] | None = None
     covariance: Array | None = None
 

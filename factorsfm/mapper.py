@@ -36,8 +36,7 @@ _DEPTH_PATIENCE = 3  # keyframes without a depth map after which one does withou
 _YOUNG_ERROR = 0.8  # relative, of a map that only the prior has shaped; falls with the square of the keyframes
 _LEAST_RELOCALIZED = 0.3  # of the similar corners must agree with the pose
 _RUNNING_OUT = 0.5  # share of an image's tracks with a point, below which the map is extended at once
-_SUDDEN = 0.3  # share of the inliers of the image before that remain within a wide threshold
-_CONSENSUS = 0.8  # share of the mapped tracks that is enough, however wide the threshold
+_CONSENSUS = 0.8  # share of the inliers of the image before that is enough, however roughly they agree
 _LEAST_SHARED = 0.7  # of the tracks of the last keyframe; with fewer, a new one is made
 
 
@@ -210,7 +209,8 @@ class Mapper:
         for position, rotation, translation in zip(start.images, start.rotation, start.translation, strict=True):
             image = next(i for i in waiting if i.tracks.position == position)
             inliers = np.isin(image.tracks.ids, start.ids)
-            self._accept(image, Registration(rotation, translation, inliers, 0.0, 0.0, np.zeros((6, 6))))
+            known = Registration(rotation, translation, inliers, 0.0, self.options.inlier_px, np.zeros((6, 6)))
+            self._accept(image, known)
             self._add_keyframe(image, None)
             self._take_over()
         # Next image as COLMAP chooses it: the one that sees most of the map.
@@ -250,11 +250,10 @@ class Mapper:
             depth_weight=o.depth_weight,
         )
         found = int(result.inliers.sum())
-        # More agree by chance within a wide threshold, as its area grows.
-        by_chance = (result.threshold / o.inlier_px) ** 2
-        needed = math.ceil(min(o.min_inliers * by_chance, max(o.min_inliers, _CONSENSUS * mapped.sum())))
-        if by_chance > 1.0:  # few of many, all at once, and those only roughly: what is seen is something else
-            needed = max(needed, math.ceil(_SUDDEN * near.inliers))
+        # More agree by chance within a threshold that is suddenly wider, as its area grows: what is seen may be
+        # something else. A young map is rough in every image.
+        by_chance = o.min_inliers * (result.threshold / near.threshold) ** 2
+        needed = math.ceil(max(o.min_inliers, min(by_chance, _CONSENSUS * near.inliers)))
         if found < needed:
             image.status = FrameStatus.TOO_FEW_INLIERS
             within = f"within {result.threshold:.1f} pixels among {mapped.sum()} mapped tracks"
@@ -305,7 +304,7 @@ class Mapper:
 
     def _accept(self, image: MappedImage, result: Registration) -> None:
         image.rotation, image.translation = result.rotation, result.translation
-        image.inliers = int(result.inliers.sum())
+        image.inliers, image.threshold = int(result.inliers.sum()), result.threshold
         image.status = FrameStatus.REGISTERED
         image.message = f"{image.inliers} inliers within {result.threshold:.1f} pixels"
         if result.affine is not None:

@@ -100,7 +100,7 @@ class Stream(Closing):
         self._size = (0, 0)
         self._colors = np.zeros((0, 3), np.uint8)
         self._pixels: list[NDArray[np.float64]] = []
-        self._without_depth: list[str] = []  # why the prior failed, once for every frame
+        self._without_depth: dict[int, str] = {}  # why the prior failed, by the frame's index
 
     def push(self, frame: Frame | NDArray[np.uint8]) -> FrameUpdate:
         """Take the next frame.
@@ -269,7 +269,7 @@ class Stream(Closing):
             options=self.options.to_dict(),
         )
         if self._without_depth:
-            count, first = len(self._without_depth), self._without_depth[0]
+            count, first = len(self._without_depth), next(iter(self._without_depth.values()))
             reconstruction.notes.append(f"Frames that went without depth because the prior failed: {count}; {first}.")
         self._thumbnails.attach(reconstruction.frames)
         return reconstruction
@@ -368,6 +368,8 @@ class Stream(Closing):
         """The prior at keypoints; once there is a map, a frame on which it fails goes without."""
         assert self._depth is not None
         assert self._mapper is not None
+        if frame.index in self._without_depth:
+            return None
         with self._timed("depth"):
             try:
                 return read_depth(self._depth, frame, xy)
@@ -375,7 +377,7 @@ class Stream(Closing):
                 if not self._mapper.started:
                     raise
                 logger.warning("%s; the frame goes without", error)
-                self._without_depth.append(str(error))
+                self._without_depth[frame.index] = str(error)
                 return None
 
     def _remember_colors(self, image: NDArray[np.uint8], ids: NDArray[np.int64], xy: NDArray[np.float64]) -> None:
