@@ -33,6 +33,7 @@ from factorsfm.image_set import ImageSet
 
 Array = NDArray[np.float64]
 
+_MOST_DEPTHS = 10_000  # of the observed points, drawn at random: enough for shares of them, and small to keep
 CODE_CHANGED = 3  # exit code: the job was written for other code than that of this process
 
 
@@ -98,7 +99,9 @@ def judge(cell: Cell, shot: Shot, estimate: Estimate) -> Record:
         size = (shot.camera.width, shot.camera.height)
         parts.append(point_depth_errors(estimate.xy[seen], estimate.depth[seen], truth, size, alignment.scale))
     depths = DepthErrors.pool(parts)
-    known = np.isfinite(depths.truth)
+    known = np.flatnonzero(np.isfinite(depths.truth))
+    if len(known) > _MOST_DEPTHS:
+        known = np.sort(np.random.default_rng(0).choice(known, _MOST_DEPTHS, replace=False))
     record = _record(cell, shot, rotations, centers, estimate.facts, depths.estimate[known], depths.truth[known])
     if estimate.given is not None:
         record.arrays["given_rotations"], record.arrays["given_centers"] = estimate.given
