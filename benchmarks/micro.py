@@ -309,7 +309,7 @@ def batch_solvers() -> str:
 def _solve_numpy(problem: Problem) -> tuple[Array, Array, int]:
     length = np.linalg.norm(problem.points, axis=1)
     bearing = problem.points / length[:, None]
-    state = State(problem.rotation, problem.translation, bearing, 1.0 / length, float(np.log(problem.focal)))
+    state = State(problem.rotation, problem.translation, bearing, 1.0 / length, np.log([problem.focal]))
     options = PolishOptions(kernel=_KERNEL, tolerance=_TOLERANCE, iterations=_ITERATIONS)
     adjustment = BundleAdjustment(state, problem.observations, options, sigma=_PIXEL_SIGMA)
     done = adjustment.solve()

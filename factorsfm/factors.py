@@ -55,21 +55,22 @@ def by_pose(by_q: Array, q: Array, w: Array) -> Array:
     return np.stack([*turn, -w * gx, -w * gy, -w * gz], -1)
 
 
-def reprojection(q: Array, observed: Array, focal: float) -> tuple[Array, Array]:
+def reprojection(q: Array, observed: Array, focal: Array | float) -> tuple[Array, Array]:
     """``f q_xy / q_z - observed``, the paper's E_PR with undistorted observations.
 
     Args:
-        q: (n, 3); observed: (n, 2) pixels relative to the principal point; focal: pixels.
+        q: (n, 3); observed: (n, 2) pixels relative to the principal point; focal: pixels, one or (n,).
 
     Returns:
         Residual (n, 2) in pixels and its derivative by `q` (n, 2, 3).
     """
     inverse = 1.0 / q[:, 2]
-    projected = q[:, :2] * inverse[:, None]
+    gain = focal * inverse
+    projected = q[:, :2] * gain[:, None]
     by_q = np.zeros((len(q), 2, 3))
-    by_q[:, 0, 0] = by_q[:, 1, 1] = focal * inverse
-    by_q[:, :, 2] = -focal * projected * inverse[:, None]
-    return focal * projected - observed, by_q
+    by_q[:, 0, 0] = by_q[:, 1, 1] = gain
+    by_q[:, :, 2] = -projected * inverse[:, None]
+    return projected - observed, by_q
 
 
 def distort(uv: Array, lens: Array) -> tuple[Array, Array, Array]:

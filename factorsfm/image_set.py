@@ -182,7 +182,7 @@ class ImageSet:
             polished = polish(
                 mapper.images,
                 mapper.points.all(),
-                mapper.focal,
+                np.array([mapper.focal]),
                 self.options,
                 lambda stage: report(stage, 0, None),
                 lens_shape(camera) if self.options.refine_focal_length else None,

@@ -97,7 +97,7 @@ def state_of(images: Sequence[MappedImage], points: Array, focal: float) -> Stat
         np.array([image.translation for image in images]),
         points / distance[:, None],
         1.0 / distance,
-        float(np.log(focal)),
+        np.log([focal]),
     )
 
 

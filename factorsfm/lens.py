@@ -38,9 +38,9 @@ _LEAST_DISPLACEMENT = 0.004  # of the width, at the outermost tracks
 
 @dataclass(frozen=True, slots=True)
 class Lens:
-    """A focal length (pixels), and (4,) distortion and principal point as in `factors.distort`."""
+    """(g,) focal lengths (pixels), and (4,) distortion and principal point as in `factors.distort`."""
 
-    focal: float
+    focal: Array
     shape: Array
 
 
@@ -50,23 +50,23 @@ class LensEstimate:
 
     Attributes:
         guess: with which the tracks were undistorted; lens: what the shot says, or the guess.
-        focal_std: relative standard deviation of the estimated focal length, believed or not.
+        focal_std: (g,) relative standard deviations of the estimated focal lengths, believed or not.
         shape_std: (4,) standard deviations of the shape, NaN where it stays as guessed.
         misfit_px: standard deviation of the tracks where they fit no lens: what an estimate says is chance then;
             0 where they do.
-        determined: whether the focal length is an estimate, not the guess.
+        determined: whether the focal lengths are estimates, not the guess.
     """
 
     guess: Lens
     lens: Lens
-    focal_std: float
+    focal_std: Array
     shape_std: Array
     misfit_px: float
     determined: bool
 
-    def renormalize(self, observations: Observations) -> Observations:
-        """What was undistorted by the guess, undistorted by the lens."""
-        return renormalized(observations, self.guess, self.lens)
+    def renormalize(self, observations: Observations, group: Index) -> Observations:
+        """What was undistorted by the guess, undistorted by the lens; `group` as in `State`."""
+        return renormalized(observations, self.guess, self.lens, group)
 
 
 def undistort(xy: Array, shape: Array) -> Array:
@@ -78,22 +78,24 @@ def undistort(xy: Array, shape: Array) -> Array:
     return np.asarray(camera.cam_from_img(xy), np.float64)
 
 
-def renormalized(observations: Observations, before: Lens, after: Lens) -> Observations:
-    """The same pixels, undistorted by another lens."""
+def renormalized(observations: Observations, before: Lens, after: Lens, group: Index) -> Observations:
+    """The same pixels, undistorted by another lens; `group` as in `State`."""
     seen = distort(observations.xy, before.shape)[0] if before.shape.any() else observations.xy
-    return replace(observations, xy=undistort(seen * (before.focal / after.focal), after.shape))
+    ratio = (before.focal / after.focal)[group[observations.frame], None]
+    return replace(observations, xy=undistort(seen * ratio, after.shape))
 
 
-def through(state: State, focal: float) -> State:
-    """The state with another focal length: points where the first camera sees them, at the depth that they have."""
-    stretch = np.exp(state.log_focal) / focal
+def through(state: State, focal: Array) -> State:
+    """The state with other focal lengths (g,): points where the first camera sees them, at the depth that they have."""
+    first = state.group[0]
+    stretch = np.exp(state.log_focal[first]) / focal[first]
     bearing = state.bearing * [stretch, stretch, 1.0]
     length = np.linalg.norm(bearing, axis=1)
     return replace(
         state,
         bearing=bearing / length[:, None],
         inverse_distance=state.inverse_distance / length,
-        log_focal=float(np.log(focal)),
+        log_focal=np.log(focal),
     )
 
 
@@ -107,21 +109,22 @@ def estimate_lens(adjustment: BundleAdjustment, guess: Lens, options: Options) -
         The adjustment with undistorted observations, whose `observations` are those of the lens.
     """
     o = replace(options.polish, tolerance=_TOLERANCE)
-    width = float(np.ptp(adjustment.observations.xy, axis=0).max())
+    groups, width = len(guess.focal), float(np.ptp(adjustment.observations.xy, axis=0).max())
     sigmas = {
         "focal": np.zeros(4),
         "distortion": np.array([_DISTORTION_SIGMA, _DISTORTION_SIGMA, 0.0, 0.0]),
         "all": np.array([_DISTORTION_SIGMA, _DISTORTION_SIGMA, _CENTER_SIGMA * width, _CENTER_SIGMA * width]),
     }[options.lens]
+    group = adjustment.state.group
     focal = search_focal(adjustment, guess, o)
     start = replace(through(adjustment.state, focal), lens=guess.shape)
-    observations = renormalized(adjustment.observations, guess, Lens(focal, guess.shape))
+    observations = renormalized(adjustment.observations, guess, Lens(focal, guess.shape), group)
     best = _solved(start, observations, o, adjustment.sigma, np.zeros(4))
     motion = classify_motion(best, best.observations, options.polish)
     moves = motion.kind is ShotKind.GENERAL
     if not moves:  # a translation that is none would bend with the lens
         best = _solved(motion.rotation_only, best.observations, o, best.sigma, np.zeros(4), moves=False)
-    std = _standard_deviations(best)[0]
+    std, _ = _standard_deviations(best)
     if sigmas.any():
         full = _solved(best.state, best.observations, o, best.sigma, sigmas, moves=moves)
         full_std, evidence = _standard_deviations(full, guess.shape)
@@ -130,53 +133,54 @@ def estimate_lens(adjustment: BundleAdjustment, guess: Lens, options: Options) -
             "distortion %s, %.0f squared deviations, displaces by %.1f pixels; focal length within %.2f %%",
             np.round(full.state.lens, 4), evidence, displacement, 100 * full_std[0],
         )  # fmt: skip
-        wide = _LEAST_DISPLACEMENT * width * np.exp(full.state.log_focal)
-        usable = full_std[0] < FOCAL_STD and bool(np.isfinite(full.observations.xy).all())
+        wide = _LEAST_DISPLACEMENT * width * float(np.median(full.state.focal))
+        usable = full_std[:groups].max() < FOCAL_STD and bool(np.isfinite(full.observations.xy).all())
         if evidence > _LEAST_EVIDENCE and displacement > wide and usable:
             best, std = full, full_std
-    lens = Lens(float(np.exp(best.state.log_focal)), best.state.lens)
-    logger.info("focal length %.1f pixels within %.2f %%, guess %.1f", lens.focal, 100 * std[0], guess.focal)
+    lens, focal_std, shape_std = Lens(np.exp(best.state.log_focal), best.state.lens), std[:groups], std[groups:]
+    logger.info("focal length %s pixels within %s %%, guess %s", lens.focal, 100 * focal_std, guess.focal)
     misfit = best.sigma if best.sigma > _MISFIT * o.doubtful_px else 0.0
-    if misfit or not std[0] < FOCAL_STD or not 1 / _LARGEST_RATIO < lens.focal / guess.focal < _LARGEST_RATIO:
-        return adjustment, LensEstimate(guess, guess, float(std[0]), np.full(4, np.nan), misfit, False)
+    far = np.abs(np.log(lens.focal / guess.focal)).max() > np.log(_LARGEST_RATIO)
+    if misfit or far or not focal_std.max() < FOCAL_STD:
+        return adjustment, LensEstimate(guess, guess, focal_std, np.full(4, np.nan), misfit, False)
     state = best.state if moves else through(start, lens.focal)
     settled = BundleAdjustment(
         replace(state, lens=np.zeros(4)), best.observations, options.polish, sigma=best.sigma
     )  # fmt: skip
     settled.solve()
-    return settled, LensEstimate(guess, lens, float(std[0]), std[1:], 0.0, True)
+    return settled, LensEstimate(guess, lens, focal_std, shape_std, 0.0, True)
 
 
-def search_focal(adjustment: BundleAdjustment, guess: Lens, options: PolishOptions) -> float:
-    """The focal length (pixels) with which a few frames fit best: candidates, then parabolas around the best."""
+def search_focal(adjustment: BundleAdjustment, guess: Lens, options: PolishOptions) -> Array:
+    """The guess (g,), times the factor with which a few frames fit best: candidates, then parabolas around the best."""
     state, few = _some_frames(adjustment.state, adjustment.observations)
     options = replace(options, iterations=_SEARCH_ITERATIONS, tolerance=1e-3)
 
-    def fit(near: State, focal: float) -> tuple[float, State]:
-        seen = renormalized(few, guess, Lens(focal, guess.shape))
+    def fit(near: State, factor: float) -> tuple[float, State]:
+        focal = factor * guess.focal
+        seen = renormalized(few, guess, Lens(focal, guess.shape), state.group)
         problem = BundleAdjustment(through(near, focal), seen, options, sigma=adjustment.sigma)
         problem.solve()
         return problem.cost(), problem.state
 
-    half = 0.5 * guess.focal * float(np.ptp(few.xy, axis=0).max())
-    candidates = np.sort(half / np.tan(_FIELDS_OF_VIEW / 2))
-    fits = {guess.focal: fit(state, guess.focal)}
-    for side in (candidates[candidates > guess.focal], candidates[candidates < guess.focal][::-1]):
-        near = fits[guess.focal][1]
-        for focal in side.tolist():
-            fits[focal] = fit(near, focal)
-            near = fits[focal][1]
+    candidates = np.sort(0.5 * float(np.ptp(few.xy, axis=0).max()) / np.tan(_FIELDS_OF_VIEW / 2))
+    fits = {1.0: fit(state, 1.0)}
+    for side in (candidates[candidates > 1.0], candidates[candidates < 1.0][::-1]):
+        near = fits[1.0][1]
+        for factor in side.tolist():
+            fits[factor] = fit(near, factor)
+            near = fits[factor][1]
     for _ in range(_PARABOLAS):
-        focals = sorted(fits)
-        best = min(range(len(focals)), key=lambda i: fits[focals[i]][0])
-        if best in (0, len(focals) - 1):
+        factors = sorted(fits)
+        best = min(range(len(factors)), key=lambda i: fits[factors[i]][0])
+        if best in (0, len(factors) - 1):
             break
-        around = focals[best - 1 : best + 2]
+        around = factors[best - 1 : best + 2]
         x = np.log(np.array(around) / around[1])
         curvature, slope, _ = np.polyfit(x, [fits[f][0] for f in around], 2)
-        focal = around[1] * float(np.exp(np.clip(-0.5 * slope / curvature, 0.5 * x[0], 0.5 * x[2])))
-        fits[focal] = fit(fits[around[1]][1], focal)
-    return min(fits, key=lambda f: fits[f][0])
+        factor = around[1] * float(np.exp(np.clip(-0.5 * slope / curvature, 0.5 * x[0], 0.5 * x[2])))
+        fits[factor] = fit(fits[around[1]][1], factor)
+    return min(fits, key=lambda f: fits[f][0]) * guess.focal
 
 
 def _some_frames(state: State, observations: Observations) -> tuple[State, Observations]:
@@ -193,6 +197,7 @@ def _some_frames(state: State, observations: Observations) -> tuple[State, Obser
         translation=state.translation[frames],
         bearing=state.bearing[points],
         inverse_distance=state.inverse_distance[points],
+        group=state.group[frames],
     )
     frame, point = observations.frame[keep], observations.point[keep]
     return part, Observations(
@@ -213,8 +218,8 @@ def _solved(
             state, observations, options, sigma=sigma, free_focal=True, free_translation=moves, lens_sigmas=known
         )
         problem.solve()
-        before, after = (Lens(float(np.exp(s.log_focal)), s.lens) for s in (state, problem.state))
-        state, observations = problem.state, renormalized(observations, before, after)
+        before, after = (Lens(np.exp(s.log_focal), s.lens) for s in (state, problem.state))
+        state, observations = problem.state, renormalized(observations, before, after, state.group)
         sigma = coordinate_sigma(problem.reprojection_errors())
     return BundleAdjustment(
         state, observations, options, sigma=sigma, free_focal=True, free_translation=moves, lens_sigmas=known
@@ -222,23 +227,23 @@ def _solved(
 
 
 def _standard_deviations(adjustment: BundleAdjustment, guess: Array | None = None) -> tuple[Array, float]:
-    """(5,) of log focal length and shape, NaN where held; and the evidence that the shape is not the guess.
+    """(g + 4,) of log focal lengths and shape, NaN where held; and the evidence that the shape is not the guess.
 
     Errors that are alike for a while, or in a part of the image, count as one. Of two ways to see how many there are,
     blocks of residuals and the pull of the tracks in each part of the image, the more doubtful one counts.
     """
-    first = 6 * len(adjustment.state.rotation)
+    first, groups = 6 * len(adjustment.state.rotation), len(adjustment.state.log_focal)
     columns = first + adjustment.free_lens
     whole, _ = adjustment.covariance(np.zeros(0, np.int64))
     inflation = block_inflation(adjustment.reprojection_vectors(), adjustment.observations)
     formal = whole[np.ix_(columns, columns)] * inflation
     pulled = _pulled_covariance(adjustment, columns)
-    std = np.full(5, np.nan)
+    std = np.full(groups + 4, np.nan)
     std[adjustment.free_lens] = np.sqrt(np.maximum(formal.diagonal(), pulled.diagonal()))
     evidence = 0.0
     if guess is not None:
-        away = (adjustment.state.lens - guess)[adjustment.free_lens[1:] - 1]
-        evidence = min(float(away @ np.linalg.solve(c[1:, 1:], away)) for c in (formal, pulled))
+        away = (adjustment.state.lens - guess)[adjustment.free_lens[groups:] - groups]
+        evidence = min(float(away @ np.linalg.solve(c[groups:, groups:], away)) for c in (formal, pulled))
     return std, evidence
 
 
@@ -253,6 +258,6 @@ def _pulled_covariance(adjustment: BundleAdjustment, columns: Index) -> Array:
 
 def _displacement(adjustment: BundleAdjustment, guess: Array) -> float:
     """By how much the shape moves the outermost observations against the guess (pixels)."""
-    xy, focal = adjustment.observations.xy, float(np.exp(adjustment.state.log_focal))
-    moved = distort(xy, adjustment.state.lens)[0] - distort(xy, guess)[0]
-    return focal * float(np.percentile(np.linalg.norm(moved, axis=1), 99))
+    o, state = adjustment.observations, adjustment.state
+    moved = state.focal[o.frame, None] * (distort(o.xy, state.lens)[0] - distort(o.xy, guess)[0])
+    return float(np.percentile(np.linalg.norm(moved, axis=1), 99))

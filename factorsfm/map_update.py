@@ -124,10 +124,10 @@ def _better_focal(adjustment: BundleAdjustment, held: NDArray[np.bool_]) -> floa
     state = free.solve(_LENS_ITERATIONS)
     covariance, _ = free.covariance(np.zeros(0, np.int64))
     variance = _ALIKE * covariance[6 * len(held), 6 * len(held)]
-    if variance > _LENS_STD**2 or abs(state.log_focal - adjustment.state.log_focal) > _LARGEST_LENS_STEP:
+    if variance > _LENS_STD**2 or abs(state.log_focal - adjustment.state.log_focal)[0] > _LARGEST_LENS_STEP:
         return None
     adjustment.state = state
-    return float(np.exp(state.log_focal))
+    return float(np.exp(state.log_focal[0]))
 
 
 def _window(keyframes: list[MappedImage]) -> tuple[list[MappedImage], NDArray[np.bool_]]:

@@ -66,7 +66,8 @@ def in_scene_unit(marginals: Marginals, state: State) -> Array:
     """
     motion = np.zeros((len(marginals.camera), 1))
     lens, images = 6 * len(state.rotation), len(state.scale)
-    affine, field = lens + 1, lens + 1 + 2 * images
+    affine = lens + len(state.log_focal)
+    field = affine + 2 * images
     motion[:lens, 0].reshape(-1, 6)[:, 3:] = state.translation
     motion[affine:field:2, 0] = -state.scale
     motion[field:, 0] = state.field

@@ -84,7 +84,7 @@ def classify_motion(adjustment: BundleAdjustment, observations: Observations, op
     kind = ShotKind.ROTATION if moved > _STATIC_SHARE else ShotKind.STATIC
     if gain > _LEAST_GAIN:
         kind = ShotKind.GENERAL
-    return Motion(kind, moved * float(np.exp(state.log_focal)), gain, rotation_only.state)
+    return Motion(kind, moved * float(np.median(state.focal)), gain, rotation_only.state)
 
 
 # --- what carries each camera -----------------------------------------------------------------------------------
@@ -105,7 +105,7 @@ def camera_observability(
     cameras = len(state.rotation)
     depth = 1.0 / np.maximum(_median_by_frame(near, o, cameras), 1e-9)
     columns = [share, share_view_axis, _median_by_frame(angle[o.point], o, cameras)]
-    columns.append(pixel_slide(pose_blocks(covariance, len(depth)), depth, float(np.exp(state.log_focal))))
+    columns.append(pixel_slide(pose_blocks(covariance, len(depth)), depth, state.focal))
     return [CameraObservability(*row) for row in np.stack(columns, 1).tolist()]
 
 
@@ -154,11 +154,11 @@ def triangulation_angles(state: State, observations: Observations) -> Array:
     return np.asarray(2.0 * np.arcsin(np.minimum(0.5 * widest, 1.0)))
 
 
-def pixel_slide(covariance: Array, depth: Array, focal: float) -> Array:
+def pixel_slide(covariance: Array, depth: Array, focal: Array | float) -> Array:
     """Standard deviation, in its worst direction, of the image of a point that rests on the optical axis.
 
     Args:
-        covariance: (k, 6, 6) of the poses; depth: (k,) of the point; focal: pixels.
+        covariance: (k, 6, 6) of the poses; depth: (k,) of the point; focal: pixels, one or (k,).
     """
     by_pose = np.zeros((len(depth), 2, 6))
     by_pose[:, 0, 1], by_pose[:, 1, 0] = -focal, focal

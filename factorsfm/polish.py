@@ -64,31 +64,34 @@ class Polished:
 def polish(
     images: list[MappedImage],
     map_points: tuple[Index, Array],
-    focal: float,
+    focal: Array,
     options: Options,
     progress: Callable[[str], None] = lambda stage: None,
     shape: Array | None = None,
+    groups: Index | None = None,
 ) -> Polished:
     """Triangulate all tracks and minimise over all registered frames.
 
     Args:
         images: at least one registered; map_points: track ids and positions of the incremental map.
-        focal: pixels, a first guess where the options refine it.
+        focal: (g,) focal lengths, pixels; first guesses where the options refine them.
         shape: (4,) distortion of the lens as in `factors.distort` where the options refine the lens; None is none.
+        groups: (images,) which of the focal lengths is that of each image; None: all have the first.
     """
     o = options.polish
     registered = [i for i, image in enumerate(images) if image.registered]
     frames = _solved_frames(images, registered, o.max_frames)
     used = [images[i] for i in frames]
     observations, tracks = _gather(used, min(o.min_track_length, max(2, len(used))))
-    state = _first_guess(used, observations, tracks, map_points, focal)
+    group = np.zeros(len(images), np.int64) if groups is None else groups
+    state = _first_guess(used, observations, tracks, map_points, focal, group[frames])
 
     progress("polish: cameras")
     core, few, adjustment = _converge_cameras(state, observations, options)
     lens = None
     if options.refine_focal_length:
         adjustment, lens = estimate_lens(adjustment, Lens(focal, np.zeros(4) if shape is None else shape), options)
-        few, observations = adjustment.observations, lens.renormalize(observations)
+        few, observations = adjustment.observations, lens.renormalize(observations, state.group)
         state = through(state, lens.lens.focal)
     motion = classify_motion(adjustment, few, o)
     inflation = block_inflation(adjustment.reprojection_vectors(), few)
@@ -128,7 +131,8 @@ def polish(
     observability = camera_observability(adjustment, marginals, camera_covariance)
     k = len(frames)
     if prior is not None:
-        affine = np.sqrt(camera_covariance.diagonal()[6 * k + 1 : 6 * k + 1 + 2 * len(prior.images)])
+        first = 6 * k + len(state.log_focal)
+        affine = np.sqrt(camera_covariance.diagonal()[first : first + 2 * len(prior.images)])
         prior.scale_std, prior.shift_std = affine[::2], affine[1::2]
     result = Polished(
         frames, adjustment.state, tracks, observations, adjustment.reprojection_errors(), sigma,
@@ -137,7 +141,7 @@ def polish(
     )  # fmt: skip
     if len(frames) < len(registered):
         progress("polish: frames between")
-        _add_frames_between(result, images, registered, options)
+        _add_frames_between(result, images, registered, group[registered], options)
     return result
 
 
@@ -156,7 +160,8 @@ def _first_guess(
     observations: Observations,
     tracks: Index,
     map_points: tuple[Index, Array],
-    focal: float,
+    focal: Array,
+    group: Index,
 ) -> State:
     """Poses in the first camera's frame, points triangulated from a few views, median inverse distance 1."""
     first = images[0]
@@ -185,14 +190,14 @@ def _first_guess(
             turn,
             translation,
             _subset(some, new),
-            focal=focal,
+            focal=float(np.median(focal)),
             inlier_px=5.0,
             sigma=_FIRST_SIGMA_PX,
             fallback=np.ones(len(new)),
         )
         bearing[new], inverse[new] = result.bearing, result.inverse_distance
     inverse = np.clip(inverse, 0.02, 20.0)
-    return State(turn, translation, bearing, inverse, float(np.log(focal)))
+    return State(turn, translation, bearing, inverse, np.log(focal), group=group)
 
 
 def _subset(observations: Observations, points: Index) -> Observations:
@@ -340,14 +345,16 @@ def _solved_frames(images: list[MappedImage], registered: list[int], limit: int)
     return sorted(keyframes + fill)
 
 
-def _add_frames_between(result: Polished, images: list[MappedImage], registered: list[int], options: Options) -> None:
-    """Register the frames that were left out on the polished points."""
+def _add_frames_between(
+    result: Polished, images: list[MappedImage], registered: list[int], group: Index, options: Options
+) -> None:
+    """Register the frames that were left out on the polished points; `group`: of each registered frame."""
     state, m = result.state, options.mapper
     seen = gather([images[f] for f in registered], result.tracks)
     if result.lens is not None:
-        seen = result.lens.renormalize(seen)
+        seen = result.lens.renormalize(seen, group)
     by_frame = {f: np.nonzero(seen.frame == k)[0] for k, f in enumerate(registered)}
-    focal = float(np.exp(state.log_focal))
+    focal = dict(zip(registered, np.exp(state.log_focal)[group].tolist(), strict=True))
     solved = np.array(result.frames)
     points = state.points
     poses = {f: (state.rotation[k], state.translation[k]) for k, f in enumerate(result.frames)}
@@ -360,7 +367,7 @@ def _add_frames_between(result: Polished, images: list[MappedImage], registered:
         near = int(solved[np.argmin(np.abs(solved - f))])
         found = register_image(
             points[seen.point[mine]], seen.xy[mine], *poses[near],
-            focal=focal, sigma=max(result.sigma, SMALLEST_SIGMA_PX), inlier_px=m.inlier_px,
+            focal=focal[f], sigma=max(result.sigma, SMALLEST_SIGMA_PX), inlier_px=m.inlier_px,
         )  # fmt: skip
         if found.inliers.sum() >= m.min_inliers:
             poses[f] = found.rotation, found.translation
@@ -371,6 +378,7 @@ def _add_frames_between(result: Polished, images: list[MappedImage], registered:
         state,
         rotation=np.array([poses[f][0] for f in frames]),
         translation=np.array([poses[f][1] for f in frames]),
+        group=group[np.isin(registered, frames)],
     )
     result.covariance = result.covariance[nearest]
     result.observability = [result.observability[k] for k in nearest]

@@ -59,8 +59,9 @@ class State:
     Attributes:
         rotation (k, 3, 3), translation (k, 3): `cam_from_world`.
         bearing (n, 3) unit, inverse_distance (n,): points seen from the world's origin.
-        log_focal: logarithm of the focal length in pixels.
+        log_focal: (g,) logarithms of the focal lengths in pixels.
         lens: (4,) distortion and principal point as in `factors.distort`, where they are estimated.
+        group: (k,) which of the focal lengths is that of each frame; by default all have the first.
         scale, shift: (images,) affine of each image with a prior.
         field: (nodes,) smooth error of the prior in units of inverse depth, shared by all its images.
     """
@@ -69,11 +70,21 @@ class State:
     translation: Array
     bearing: Array
     inverse_distance: Array
-    log_focal: float
+    log_focal: Array
     lens: Array = field(default_factory=lambda: np.zeros(4))
+    group: Index = field(default_factory=lambda: np.zeros(0, np.int64))
     scale: Array = field(default_factory=lambda: np.zeros(0))
     shift: Array = field(default_factory=lambda: np.zeros(0))
     field: Array = field(default_factory=lambda: np.zeros(0))
+
+    def __post_init__(self) -> None:
+        if not len(self.group):
+            self.group = np.zeros(len(self.rotation), np.int64)
+
+    @property
+    def focal(self) -> Array:
+        """(k,) focal length of each frame, pixels."""
+        return np.asarray(np.exp(self.log_focal)[self.group])
 
     @property
     def points(self) -> Array:

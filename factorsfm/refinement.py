@@ -34,13 +34,15 @@ def _newton_step(state: State, information: Array, gradient: Array) -> Array:
 
 
 class BundleAdjustment:
-    """Levenberg-Marquardt over poses, points, focal length, prior affines and the prior's smooth error field.
+    """Levenberg-Marquardt over poses, points, focal lengths, prior affines and the prior's smooth error field.
 
     Args:
         observations: sorted by point; every point has at least one.
         sigma: standard deviation of an observation (pixels).
         free_translation: False estimates rotations and bearings alone.
-        free_focal: whether the focal length is estimated.
+        free_focal: whether the focal lengths are estimated.
+        focal_information: (g, g) information matrix with which the logarithms of the focal lengths are known to be
+            zero, or, where it is singular, some combinations of them; None: nothing is known.
         lens_sigmas: (4,) standard deviations with which `State.lens` is known beforehand (0: exactly); None: it is
             zero, the observations are undistorted.
         points_only: True holds everything but the points fixed.
@@ -57,6 +59,7 @@ class BundleAdjustment:
         sigma: float,
         free_translation: bool = True,
         free_focal: bool = False,
+        focal_information: Array | None = None,
         lens_sigmas: Array | None = None,
         points_only: bool = False,
         fixed: NDArray[np.bool_] | None = None,
@@ -71,25 +74,28 @@ class BundleAdjustment:
         self.prior = prior
         self.iterations = 0
         self._anchor = state.inverse_distance.copy()
+        self._focal_information = focal_information
+        self._group = state.group[observations.frame]
         self._lens_sigmas = lens_sigmas
         self._lens_anchor = state.lens
         seen = observations.xy if lens_sigmas is None else distort(observations.xy, state.lens)[0]
-        self._pixels = seen * np.exp(state.log_focal)  # what was measured, whatever the lens
+        self._pixels = seen * self._focal(state)[:, None]  # what was measured, whatever the lens
         frames, images, nodes = len(state.rotation), len(state.scale), len(state.field)
         self._lens = 6 * frames
-        self._affine = self._lens + (1 if lens_sigmas is None else 5)
+        self._shape = self._lens + len(state.log_focal)
+        self._affine = self._shape + (0 if lens_sigmas is None else 4)
         self._field = self._affine + 2 * images
         self._columns = self._field + nodes
         free = np.ones(self._columns, bool)
         held = np.arange(frames) == 0 if fixed is None else fixed
         free[: self._lens] = np.repeat(~held, 6)
-        free[self._lens] = free_focal
+        free[self._lens : self._shape] = free_focal
         if lens_sigmas is not None:
-            free[self._lens + 1 : self._affine] = lens_sigmas > 0
+            free[self._shape : self._affine] = lens_sigmas > 0
         if not free_translation:
             free[: self._lens].reshape(-1, 6)[:, 3:] = False
         self._free = np.nonzero(free & (not points_only))[0]
-        self.free_lens = np.nonzero(free[self._lens : self._affine])[0]  # of log focal length and `State.lens`
+        self.free_lens = np.nonzero(free[self._lens : self._affine])[0]  # of log focal lengths and `State.lens`
         self._elimination = Elimination(self._columns, len(state.bearing))
 
     # --- residuals ----------------------------------------------------------------------------------------------
@@ -110,24 +116,30 @@ class BundleAdjustment:
         """(m,) robust cost of each observation; noise alone costs about one."""
         return cauchy(self._reprojection(self.state)[0], self.options.kernel)[0]
 
+    def _focal(self, state: State) -> Array:
+        """(m,) focal length of each observation, pixels; (1,) where all have the same."""
+        focal = np.exp(state.log_focal)
+        return np.asarray(focal if len(focal) == 1 else focal[self._group])
+
     def _reprojection(self, state: State) -> tuple[Array, Array, Array]:
-        o, focal = self.observations, np.exp(state.log_focal)
+        o, focal = self.observations, self._focal(state)
         q = state.camera_points(o.frame, o.point)
         behind = q[:, 2] <= 1e-6
         q[behind, 2] = 1e-6
         residual, by_q = reprojection(q, self._pixels, focal)
         if self._lens_sigmas is not None:
             uv, by_uv, _ = distort(q[:, :2] / q[:, 2:], state.lens)
-            residual, by_q = focal * uv - self._pixels, by_uv @ by_q
+            residual, by_q = focal[:, None] * uv - self._pixels, by_uv @ by_q
         by_q[behind] = 0.0
         return residual / self.sigma, by_q / self.sigma, q
 
     def _by_lens(self, residual: Array, q: Array) -> Array:
-        """(m, 2, c) derivative of the residuals by the columns of the lens."""
+        """(m, 2, c) derivative of the residuals by the columns of the lens: focal length of the frame, shape."""
         by_focal = (residual + self._pixels / self.sigma)[:, :, None]  # d r / d log f is the prediction
         if self._lens_sigmas is None:
             return np.asarray(by_focal)
-        by_lens = distort(q[:, :2] / q[:, 2:], self.state.lens)[2] * (np.exp(self.state.log_focal) / self.sigma)
+        by_lens = distort(q[:, :2] / q[:, 2:], self.state.lens)[2]
+        by_lens *= (self._focal(self.state) / self.sigma)[:, None, None]
         return np.concatenate([by_focal, by_lens], 2)
 
     def _lens_prior(self, state: State) -> tuple[Array, Array]:
@@ -156,6 +168,8 @@ class BundleAdjustment:
         cost += 0.5 * (((state.inverse_distance - self._anchor) / self._point_sigma) ** 2).sum()
         difference, information = self._lens_prior(state)
         cost += 0.5 * (information * difference**2).sum()
+        if self._focal_information is not None:
+            cost += 0.5 * state.log_focal @ self._focal_information @ state.log_focal
         if (p := self.prior) is not None:
             cost += cauchy(self._prior(state)[0][:, None], self.options.kernel)[0].sum()
             cost += 0.5 * state.field @ p.field_information @ state.field
@@ -178,8 +192,10 @@ class BundleAdjustment:
         by_lens = (self._by_lens(residual, q) * weight[:, None, None]).transpose(1, 0, 2)
         by_camera = np.concatenate([by_pose(gain, q, s.inverse_distance[o.point]), by_lens], 2)
         by_point = gain.transpose(1, 0, 2) @ self._by_point(tangent, o.frame, o.point)
-        lens = np.broadcast_to(np.arange(self._lens, self._affine), (len(q), self._affine - self._lens))
-        columns = np.concatenate([6 * o.frame[:, None] + np.arange(6), lens], 1)
+        shape = np.broadcast_to(np.arange(self._shape, self._affine), (len(q), self._affine - self._shape))
+        columns = np.concatenate(
+            [6 * o.frame[:, None] + np.arange(6), self._lens + self._group[:, None], shape], 1
+        )  # fmt: skip
         terms = [
             Term(
                 (residual * weight[:, None]).T,
@@ -228,11 +244,15 @@ class BundleAdjustment:
         )  # fmt: skip
         point[:, 2, 2] += 1.0 / self._point_sigma**2
         point_gradient[:, 2] += (s.inverse_distance - self._anchor) / self._point_sigma**2
+        if self._focal_information is not None:
+            focal = slice(self._lens, self._shape)
+            camera[focal, focal] += self._focal_information
+            gradient[focal] += self._focal_information @ s.log_focal
         if self._lens_sigmas is not None:
-            lens = np.arange(self._lens + 1, self._affine)
+            shape = np.arange(self._shape, self._affine)
             difference, information = self._lens_prior(s)
-            camera[lens, lens] += information
-            gradient[lens] += information * difference
+            camera[shape, shape] += information
+            gradient[shape] += information * difference
         if (p := self.prior) is not None:
             affine = np.arange(self._affine, self._field)
             information = np.tile([p.scale_sigma**-2.0, p.shift_sigma**-2.0], len(s.scale))
@@ -267,9 +287,10 @@ class BundleAdjustment:
         s = self.state
         pose = camera[: self._lens].reshape(-1, 6)
         turn = _exponential(-pose[:, :3])
-        by_lens = float(camera[self._lens])
+        log_focal = camera[self._lens : self._shape]
+        by_lens = float(log_focal[s.group[0]])
         # A new focal length moves the points along, so that the first camera sees them where it did: what the step
-        # says of that to first order is done in full.
+        # says of that to first order is done in full. The other focal lengths are relative to that of the first camera.
         stretch = np.array([np.exp(-by_lens), np.exp(-by_lens), 1.0])
         tangent, side = tangent_basis(s.bearing), s.bearing * [1.0, 1.0, 0.0]
         turned = point[:, :2] + by_lens * np.einsum("ni,nij->nj", side, tangent)
@@ -282,11 +303,12 @@ class BundleAdjustment:
             translation=np.einsum("nij,nj->ni", turn, s.translation - pose[:, 3:]),
             bearing=bearing / length[:, None],
             inverse_distance=(s.inverse_distance + nearer) / length,
-            log_focal=s.log_focal + by_lens,
-            lens=s.lens if self._lens_sigmas is None else s.lens + camera[self._lens + 1 : self._affine],
+            log_focal=s.log_focal + log_focal,
+            lens=s.lens if self._lens_sigmas is None else s.lens + camera[self._shape : self._affine],
             scale=s.scale + affine[:, 0],
             shift=s.shift + affine[:, 1],
             field=s.field + camera[self._field :],
+            group=s.group,
         )
 
     def solve(self, iterations: int | None = None, solve_cameras: CameraSolver = _newton_step) -> State:
@@ -323,8 +345,8 @@ class BundleAdjustment:
         """Joint covariance of the camera side, and of the inverse distances of some points.
 
         Returns:
-            (c, c) over the columns (six per frame in GTSAM's pose convention, log focal, scale and shift per image,
-            field), zero where a column is fixed; (p, p) of the inverse distances of `points`.
+            (c, c) over the columns (six per frame in GTSAM's pose convention, log focal lengths, scale and shift per
+            image, field), zero where a column is fixed; (p, p) of the inverse distances of `points`.
         """
         marginals = self.marginals()
         camera, given_camera = marginals.camera, marginals.point

@@ -61,7 +61,7 @@ def assemble(
     unit = scale or 1.0
     lens = polished.lens
     if lens is not None:
-        focal, shape = lens.lens.focal, lens.lens.shape
+        focal, shape = float(np.median(state.focal)), lens.lens.shape
         camera = with_lens(camera, focal, shape) if shape.any() else with_focal(camera, focal)
     kept, row_of = _usable_points(polished)
     observations = polished.observations
@@ -208,7 +208,7 @@ def _notes(polished: Polished, has_depth: bool) -> list[str]:
 
 
 def _lens_note(estimate: LensEstimate) -> str:
-    focal, std = estimate.lens.focal, f"standard deviation {100 * estimate.focal_std:.1f} %"
+    focal, std = float(np.median(estimate.lens.focal)), f"standard deviation {100 * estimate.focal_std.max():.1f} %"
     if not estimate.determined:
         reason = f"this shot does not determine it ({std})"
         if estimate.misfit_px:
@@ -223,4 +223,4 @@ def _lens_note(estimate: LensEstimate) -> str:
 
 def _lens_fit(estimate: LensEstimate) -> LensFit:
     shape = [float(std) if np.isfinite(std) else None for std in estimate.shape_std]
-    return LensFit(estimate.determined, estimate.focal_std if estimate.determined else None, *shape)
+    return LensFit(estimate.determined, float(estimate.focal_std.max()) if estimate.determined else None, *shape)

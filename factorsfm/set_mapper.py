@@ -277,8 +277,9 @@ class SetMapper:
         free_focal = self._refine_focal and len(self._order) >= _FOCAL_IMAGES and self._angle > _FOCAL_ANGLE_DEG
         adjustment = BundleAdjustment(state, observations, self._adjustment, sigma=sigma, free_focal=free_focal)
         state = adjustment.solve()
-        if free_focal and 0.3 < float(np.exp(state.log_focal)) / self._guess < 3.0:
-            self._set_focal(float(np.exp(state.log_focal)))
+        focal = float(np.exp(state.log_focal[0]))
+        if free_focal and 0.3 < focal / self._guess < 3.0:
+            self._set_focal(focal)
         errors = adjustment.reprojection_errors()
         logger.debug(
             "adjusted %d images, %d points, %d observations to %.2f px in %d iterations",

@@ -251,7 +251,7 @@ class Stream(Closing):
             result = polish(
                 mapper.images,
                 mapper.points.all(),
-                mapper.focal,
+                np.array([mapper.focal]),
                 self.options,
                 lambda stage: progress(stage, 0, None) if progress else None,
                 lens_shape(self.camera) if self.options.refine_focal_length else None,

@@ -84,7 +84,7 @@ def triangulate(
         translation,
         chosen[:, :3] / distance[:, None],
         chosen[:, 3] / distance,
-        float(np.log(focal)),
+        np.log([focal]),
     )
     if affine is not None:
         state = replace(state, scale=affine[:, 0], shift=affine[:, 1], field=np.zeros(1))

@@ -56,7 +56,7 @@ def make_problem(motion, *, frames=10, points=100, parallax=0.05, noise_px=0.0, 
         translation=np.array([pose.translation for pose in scene.cam_from_world]) * unit,
         bearing=points / distance[:, None],
         inverse_distance=1 / distance,
-        log_focal=np.log(focal),
+        log_focal=np.log([focal]),
     )
     observations = Observations(np.tile(np.arange(frames), n), np.repeat(np.arange(n), frames), xy.reshape(-1, 2))
     return Problem(truth, points, observations, focal, noise_px)

@@ -49,7 +49,7 @@ class Shot:
             np.array([image.translation for image in window]),
             self.points[ids] / distance[:, None],
             1.0 / distance,
-            np.log(self.problem.focal),
+            np.log([self.problem.focal]),
         )
         fixed, o = np.arange(len(frames)) < held, gather(window, ids)
         guided = [k for k in frames if self.images[k].tracks.depth is not None]

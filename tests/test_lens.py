@@ -23,13 +23,13 @@ BARREL = np.array([-0.15, 0.02, 0.0, 0.0])
 
 def estimated(problem, *, guess=1.3, shape=None, lens="distortion"):
     """The polish of a problem whose lens has a shape, from tracks that a guess normalised without it."""
-    truth = Lens(problem.focal, np.zeros(4))
+    truth = Lens(np.array([problem.focal]), np.zeros(4))
     seen = replace(
         problem.observations, xy=distort(problem.observations.xy, np.zeros(4) if shape is None else shape)[0]
     )
-    wrong = Lens(guess * problem.focal, np.zeros(4))
+    wrong = Lens(guess * truth.focal, np.zeros(4))
     start = through(problem.truth, wrong.focal)
-    images = mapped_images(replace(problem, observations=renormalized(seen, truth, wrong)), start)
+    images = mapped_images(replace(problem, observations=renormalized(seen, truth, wrong, start.group)), start)
     points = np.arange(len(start.bearing)), start.points
     options = replace(Options.preset_named("geometry"), lens=lens)
     return polish(images, points, wrong.focal, options)
@@ -51,29 +51,40 @@ def test_distortion_derivatives_and_inverse():
     np.testing.assert_allclose(undistort(distorted, shape), uv, atol=1e-9)
 
 
+@pytest.mark.parametrize("group", [[0, 0, 0, 0, 0], [1, 0, 2, 2, 1]])
 @pytest.mark.parametrize("kernel", [2.0, 1e6])
-def test_the_gradient_of_the_lens_columns_is_that_of_the_cost(kernel):
+def test_the_gradient_of_the_lens_columns_is_that_of_the_cost(kernel, group):
     problem = make_problem("handheld", frames=5, points=40, parallax=0.1, noise_px=1.0)
-    start = replace(problem.truth, lens=np.array([-0.1, 0.05, 0.003, 0.002]))
+    groups = max(group) + 1
+    focal = problem.truth.log_focal + 0.02 * np.arange(groups)
+    start = replace(
+        problem.truth, lens=np.array([-0.1, 0.05, 0.003, 0.002]), log_focal=focal, group=np.array(group)
+    )  # fmt: skip
+    information = np.cov(np.random.default_rng(0).standard_normal((groups, 9))).reshape(groups, groups)
     sigmas = np.array([0.1, 0.1, 0.02, 0.02])
     options = PolishOptions(kernel=kernel)
     adjustment = BundleAdjustment(
-        start, problem.observations, options, sigma=0.5, free_focal=True, lens_sigmas=sigmas
+        start, problem.observations, options, sigma=0.5, free_focal=True, lens_sigmas=sigmas,
+        focal_information=information,
     )  # fmt: skip
-    adjustment.state = replace(start, lens=start.lens + 0.01, log_focal=start.log_focal + 0.01)
+    adjustment.state = replace(
+        start, lens=start.lens + 0.01, log_focal=start.log_focal + 0.01 * np.arange(1, groups + 1)
+    )
     normal = adjustment._linearize()
     lens = 6 * problem.frames
-    assert len(normal.camera_gradient) == lens + 5
+    size = lens + groups + 4
+    assert len(normal.camera_gradient) == size
 
     def slope(column):
         costs = []
         for sign in (1, -1):
-            camera = np.zeros(lens + 5)
+            camera = np.zeros(size)
             camera[column] = sign * 1e-6
             costs.append(adjustment._cost(adjustment._retract(camera, np.zeros((len(problem.points), 3)))))
         return (costs[0] - costs[1]) / 2e-6
 
-    expected = [slope(column) for column in range(lens + 5)]
+    expected = np.array([slope(column) for column in range(size)])
+    assert (np.abs(expected[lens:]) > 1e-3).all()  # every column takes part
     np.testing.assert_allclose(
         normal.camera_gradient, expected, rtol=1e-5, atol=1e-5 * np.abs(expected).max()
     )  # fmt: skip
@@ -81,7 +92,7 @@ def test_the_gradient_of_the_lens_columns_is_that_of_the_cost(kernel):
 
 def test_a_new_focal_length_leaves_the_first_image_as_it_is():
     truth = make_problem("truck", frames=3, points=30).truth
-    other = through(truth, 500.0)
+    other = through(truth, np.array([500.0]))
     points = np.arange(len(truth.bearing))
     first = np.zeros_like(points), points
     before, after = (s.camera_points(*first) for s in (truth, other))
@@ -90,11 +101,30 @@ def test_a_new_focal_length_leaves_the_first_image_as_it_is():
     np.testing.assert_allclose(other.inverse_distance / after[:, 2], truth.inverse_distance / before[:, 2])
 
 
+def test_the_lenses_of_several_cameras_are_found():
+    problem = make_problem("arc", frames=10, points=200, parallax=0.3, noise_px=0.05)
+    groups = np.array([0, 0, 1, 1, 2, 2, 1, 0, 2, 1])
+    truth = Lens(problem.focal * np.array([1.0, 1.0, 1.0]), np.zeros(4))
+    wrong = Lens(problem.focal * np.array([1.3, 1.15, 1.4]), np.zeros(4))
+    start = through(problem.truth, np.array([1.3 * problem.focal]))
+    images = mapped_images(
+        replace(problem, observations=renormalized(problem.observations, truth, wrong, groups)), start
+    )
+    options = replace(Options.preset_named("geometry"), lens="focal")
+    points = np.arange(len(start.bearing)), start.points
+    result = polish(images, points, wrong.focal, options, groups=groups)
+    assert result.lens.determined
+    error = np.log(result.lens.lens.focal / problem.focal)
+    assert 1e-7 < np.abs(error).max() < 0.01
+    assert (np.abs(error) < 5 * result.lens.focal_std).all()
+    np.testing.assert_array_equal(result.state.group, groups)
+
+
 @pytest.mark.parametrize("guess", [0.6, 2.0])
 def test_the_focal_length_is_found_from_a_wrong_guess(guess):
     problem = make_problem("arc", frames=8, points=200, parallax=0.3, noise_px=0.05)
     result = estimated(problem, guess=guess)
-    error = result.lens.lens.focal / problem.focal - 1
+    error = result.lens.lens.focal[0] / problem.focal - 1
     assert result.lens.determined
     assert 1e-7 < abs(error) < 0.03
     assert 1e-5 < result.lens.focal_std < FOCAL_STD
@@ -114,7 +144,7 @@ def test_the_standard_deviation_is_consistent_with_the_error():
         problem = make_problem("arc", frames=6, points=150, parallax=0.3, noise_px=0.05, seed=seed)
         found = estimated(problem, guess=1.2, lens="focal").lens
         assert found.determined
-        results.append(np.log(found.lens.focal / problem.focal) / found.focal_std)
+        results.append(np.log(found.lens.focal[0] / problem.focal) / found.focal_std[0])
     assert 0.3 < np.sqrt(np.mean(np.square(results))) < 1.7
 
 

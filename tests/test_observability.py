@@ -297,7 +297,7 @@ def polished(problem, **options):
     preset = Options.preset_named("geometry")
     preset = replace(preset, polish=replace(preset.polish, **options))
     points = np.arange(len(problem.points)), problem.points
-    return polish(images_of(problem, problem.truth), points, problem.focal, preset)
+    return polish(images_of(problem, problem.truth), points, np.array([problem.focal]), preset)
 
 
 def test_the_polish_says_what_carries_each_camera():

@@ -45,7 +45,7 @@ def test_the_truth_is_found_from_a_damaged_map(motion, damage):
     problem = make_problem(motion, frames=12, points=200, parallax=0.05, noise_px=0.1)
     start = damage(problem.truth)
     points = np.arange(len(start.bearing)), start.points
-    result = polish(images_of(problem, start), points, problem.focal, Options.preset_named("geometry"))
+    result = polish(images_of(problem, start), points, np.array([problem.focal]), Options.preset_named("geometry"))
     assert result.motion.kind is ShotKind.GENERAL
     state = in_unit_of(result.state, problem_truth := replace(
         problem.truth,
@@ -76,7 +76,7 @@ def test_a_long_shot_registers_the_frames_between_on_the_polished_points():
     options = Options.preset_named("geometry")
     options = replace(options, polish=replace(options.polish, max_frames=6))
     points = np.arange(len(problem.truth.bearing)), problem.truth.points
-    result = polish(images_of(problem, problem.truth), points, problem.focal, options)
+    result = polish(images_of(problem, problem.truth), points, np.array([problem.focal]), options)
     assert result.frames == list(range(12))
     assert result.covariance.shape == (12, 6, 6)
     assert angles_between(result.state.rotation, problem.truth.rotation).max() < 1e-3

@@ -246,6 +246,38 @@ def test_the_focal_length_is_recovered(factor):
     assert held.cost() > 100 * adjustment.cost() + 1.0
 
 
+def test_groups_of_focal_lengths_are_recovered():
+    """Frames of three lenses, each normalised by a guess of its own."""
+    problem = make_problem("arc", parallax=0.3, points=150)
+    o, group = problem.observations, np.array([1, 0, 2, 1, 1, 0, 2, 2, 0, 1])
+    factor = np.array([0.93, 1.05, 1.1])
+    guess = replace(perturbed(problem.truth), log_focal=problem.truth.log_focal + np.log(factor), group=group)
+    normalized = Observations(o.frame, o.point, o.xy / factor[group[o.frame], None])
+    adjustment = BundleAdjustment(guess, normalized, EXACT, sigma=0.25, free_focal=True)
+    state = adjustment.solve()
+    np.testing.assert_allclose(np.exp(state.log_focal), problem.focal, rtol=1e-5)
+    np.testing.assert_array_equal(state.group, group)
+    assert_cameras(state, problem.truth, angle_rad=1e-5, distance=1e-5)
+    held = BundleAdjustment(guess, normalized, EXACT, sigma=0.25)
+    np.testing.assert_array_equal(held.solve().log_focal, guess.log_focal)
+
+
+def test_what_is_known_of_the_focal_lengths_holds_them_together():
+    """A tight random walk makes one focal length of many that are free."""
+    problem = make_problem("arc", parallax=0.3, points=150, noise_px=0.3)
+    k = problem.frames
+    truth = replace(problem.truth, log_focal=np.repeat(problem.truth.log_focal, k), group=np.arange(k))
+    step = np.diff(np.eye(k), axis=0)
+    spreads = []
+    for sigma in (1e3, 1e-7):
+        adjustment = BundleAdjustment(
+            truth, problem.observations, EXACT, sigma=0.3, free_focal=True, focal_information=step.T @ step / sigma**2
+        )
+        spreads.append(np.ptp(adjustment.solve().log_focal))
+    assert spreads[0] > 1e-3
+    assert spreads[1] < 1e-5
+
+
 def test_points_only_holds_the_cameras():
     problem = make_problem("truck")
     prior, truth = with_prior(problem, [0, 4], noise=0.0)
@@ -391,6 +423,6 @@ def test_covariance_of_the_focal_length():
         adjustment = BundleAdjustment(problem.truth, problem.observations, options, sigma=0.2, free_focal=True)
         state = adjustment.solve()
         camera, _ = adjustment.covariance(np.zeros(0, np.int64))
-        errors.append(state.log_focal - problem.truth.log_focal)
+        errors.append(state.log_focal[0] - problem.truth.log_focal[0])
         deviations.append(np.sqrt(camera[30, 30]))
     assert_calibrated([(e**2 / d**2, 1) for e, d in zip(errors, deviations, strict=True)])
