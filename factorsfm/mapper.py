@@ -37,6 +37,7 @@ _YOUNG_ERROR = 0.8  # relative, of a map that only the prior has shaped; falls w
 _LEAST_RELOCALIZED = 0.3  # of the similar corners must agree with the pose
 _RUNNING_OUT = 0.5  # share of an image's tracks with a point, below which the map is extended at once
 _CONSENSUS = 0.8  # share of the inliers of the image before that is enough, however roughly they agree
+_SETTLED, _SETTLED_DELAY = 5, 2  # keyframes of a map that changes little; frames that it waits longer for the graph
 _LEAST_SHARED = 0.7  # of the tracks of the last keyframe; with fewer, a new one is made
 
 
@@ -356,7 +357,8 @@ class Mapper:
         read = read_depth if self._uses_keyframe_depth else None
         self._update = self._worker.submit(update_map, copy, self.graph, read)
         image.keyframe = True
-        self._due = len(self.images) - 1 + self.options.graph_delay
+        settled = _SETTLED_DELAY if len(self.keyframes) >= _SETTLED else 0
+        self._due = len(self.images) - 1 + self.options.graph_delay + settled
 
     def _take_over(self) -> None:
         """Wait for the graph, and take over the map as it sees it now."""

@@ -59,8 +59,8 @@ class MapperOptions:
         keyframe_interval: frames after which a keyframe is made at the latest.
         landmarks: landmarks of the graph that a keyframe sees.
         graph_iterations: steps of the graph at a keyframe.
-        graph_delay: frames after a keyframe at which the map takes over what the graph made of it; until then the
-            graph works beside the registration.
+        graph_delay: frames after a keyframe at which the map takes over what the graph made of it, later where the map
+            has settled; until then the graph works beside the registration.
         pixel_sigma: standard deviation of a tracked point in the graph (pixels).
         essential_angle_deg: median triangulation angle that a start without depth waits for.
     """

@@ -191,7 +191,8 @@ class BundleAdjustment:
         gain = np.ascontiguousarray((by_q * weight[:, None, None]).transpose(1, 0, 2))
         by_lens = (self._by_lens(residual, q) * weight[:, None, None]).transpose(1, 0, 2)
         by_camera = np.concatenate([by_pose(gain, q, s.inverse_distance[o.point]), by_lens], 2)
-        by_point = gain.transpose(1, 0, 2) @ self._by_point(tangent, o.frame, o.point)
+        by_bearing = s.rotation[o.frame] @ tangent[o.point]
+        by_point = gain.transpose(1, 0, 2) @ np.concatenate([by_bearing, s.translation[o.frame][:, :, None]], 2)
         shape = np.broadcast_to(np.arange(self._shape, self._affine), (len(q), self._affine - self._shape))
         columns = np.concatenate(
             [6 * o.frame[:, None] + np.arange(6), self._lens + self._group[:, None], shape], 1
@@ -212,8 +213,8 @@ class BundleAdjustment:
             by_z, by_w, unit = by_z * weight, by_w * weight, weight / p.sigma
             along_z = np.zeros((len(q), 3))
             along_z[:, 2] = by_z
-            by_point = by_z[:, None] * self._by_point(tangent, p.frame, p.point)[:, 2]
-            by_point[:, 2] += by_w
+            along = np.einsum("mi,mij->mj", s.rotation[p.frame, 2], tangent[p.point])
+            by_point = np.column_stack([by_z[:, None] * along, by_z * s.translation[p.frame, 2] + by_w])
             by_affine = np.stack([prediction * unit, unit], -1)
             by_field = (s.scale[p.image] * unit)[:, None] * p.node_weights
             by_camera = np.concatenate([by_pose(along_z, q, s.inverse_distance[p.point]), by_affine, by_field], 1)
@@ -230,11 +231,6 @@ class BundleAdjustment:
                 )
             )
         return terms
-
-    def _by_point(self, tangent: Array, frame: Index, point: Index) -> Array:
-        """(m, 3, 3) derivative of `q` by the bearing's two tangent directions and the inverse distance."""
-        by_bearing = self.state.rotation[frame] @ tangent[point]
-        return np.concatenate([by_bearing, self.state.translation[frame][:, :, None]], 2)
 
     def _linearize(self) -> Normal:
         s = self.state
