@@ -9,7 +9,6 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from html import escape
-from importlib.resources import files
 from pathlib import Path
 from string import Template
 from typing import Any
@@ -21,6 +20,7 @@ import numpy as np
 from factorsfm.batch.plan import Job, Video
 from factorsfm.errors import InputError
 from factorsfm.export.folder import check_directory
+from factorsfm.report.document import document, packaged
 from factorsfm.report.wording import grade_of
 from factorsfm.summary import PROGRAM, json_text, program_version
 
@@ -156,14 +156,13 @@ class Index:
             "Frames solved": f"{totals['registered']:,}",
             "Computing": _duration(totals["seconds"]),
         }
-        return Template(_file("factorsfm.batch", "index.html")).substitute(
-            title=escape(f"{self._source} – {PROGRAM} shots"),
+        body = Template(packaged("factorsfm.batch", "index.html")).substitute(
             source=escape(str(self._source)),
             verdict=_verdict(totals),
             facts="".join(f"<div><dt>{name}</dt><dd>{value}</dd></div>" for name, value in facts.items()),
             videos="".join(self._video_html(video) for video in (*self._shots, *self._unread)),
-            style=_file("factorsfm.report", "page.css") + _file("factorsfm.batch", "index.css"),
         )
+        return document(f"{self._source} – {PROGRAM} shots", body, styles=packaged("factorsfm.batch", "index.css"))
 
     def _video_html(self, video: Video) -> str:
         entries = [entry for entry in self.entries if entry.folder.rpartition("/")[0] == video.name]
@@ -252,7 +251,3 @@ def _thumbnail(report: Path) -> bytes | None:
         ".jpg", cv2.resize(image, size, interpolation=cv2.INTER_AREA), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
     )
     return jpeg.tobytes()
-
-
-def _file(package: str, name: str) -> str:
-    return files(package).joinpath(name).read_text(encoding="utf-8")
