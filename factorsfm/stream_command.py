@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 
-from factorsfm.api import check_matched, guessed_camera
+from factorsfm.api import check_matched
 from factorsfm.camera import camera_to_json, read_camera
 from factorsfm.episode import Episode, ShotResult
 from factorsfm.errors import InputError, ReconstructionError
@@ -117,9 +117,6 @@ def run(arguments: argparse.Namespace, progress: Progress, show: Show) -> str:
                 line = _Line(show, source, arguments.cuts)
                 for frame in interrupt.until(incoming):
                     if target is None:
-                        if camera is None:
-                            camera = guessed_camera(arguments.source, frame)
-                            options = options.for_unknown_lens()
                         kind = Episode if arguments.cuts else Stream
                         target = kind(camera, depth=watched, masks=masks, options=options)
                     start = time.perf_counter()
