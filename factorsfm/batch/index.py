@@ -124,7 +124,7 @@ class Index:
         return {
             "program": PROGRAM,
             "version": program_version(),
-            "source": self._source,
+            "source": self._source.absolute(),
             **self._totals(),
             "videos": [
                 {**video.to_dict(), "shots": [[frames.start, frames.stop] for frames in found]}
@@ -171,11 +171,11 @@ class Index:
         return f'<section><h2>{escape(video.path.name)}</h2>{reason}<ol class="shots">{rows}</ol></section>'
 
 
-def shots_known(output: Path) -> dict[str, list[range]]:
+def shots_known(output: Path, source: Path) -> dict[str, list[range]]:
     """Shots that an earlier run has found, by the JSON text of `Video.to_dict`; empty if another version did.
 
     Raises:
-        InputError: the folder cannot be written, or holds something else than an earlier run.
+        InputError: the folder cannot be written, or holds something else than an earlier run on this source.
     """
     path = output / "index.json"
     if not path.exists():
@@ -185,6 +185,8 @@ def shots_known(output: Path) -> dict[str, list[range]]:
         content = json.loads(path.read_text(encoding="utf-8"))
         if content["program"] != PROGRAM:
             raise ValueError(content["program"])
+        if (earlier := content["source"]) != str(source.absolute()):
+            raise InputError(f"{output} holds the shots of {earlier}, not of {source}; choose a new or empty folder")
         if content["version"] != program_version():
             return {}
         found = [([range(*pair) for pair in video.pop("shots")], video) for video in content["videos"]]
