@@ -62,7 +62,9 @@ def assemble(
     if polished.lens is None and not lens_given:
         origin = "that of the EXIF data" if camera.has_prior_focal_length else "a guess"
         pixels_long = f"{camera.mean_focal_length():.0f} pixels"
-        notes.append(f"The focal length is {origin} ({pixels_long}): no camera was given, and the lens was to stay fixed.")
+        notes.append(
+            f"The focal length is {origin} ({pixels_long}): no camera was given, and the lens was to stay fixed."
+        )
     scale = _metric_scale(polished, images) if metric else None
     unit = scale or 1.0
     lens = polished.lens
