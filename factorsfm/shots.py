@@ -29,11 +29,9 @@ _CUT = 0.12  # dissimilarity that no motion of a camera reaches between two fram
 _ABOVE_MEDIAN = 3.0  # ... and how many times that of the frames before, where the motion is always large
 _HISTORY = 12  # frames
 _DARK = 12  # blank frames after which a moving camera makes twice the difference
-_CLEAR = (
-    0.5  # contrast of a view that later ones are compared with after a gap, as a share of the highest not long before
-)
-_FADED_IN = 0.5  # share of the textured blocks before a gap that must be back before the view can be compared ...
-_FADE = 12  # ... but no more frames than this are waited for
+_CLEAR, _CLEAR_SHARE = 8.0, 0.5  # contrast of what is compared: grey levels, or a share of the highest not long before
+_FADED = 4.0  # contrast, grey levels, of a view that shows too little to be compared unless the others are like it ...
+_FADE = 12  # ... for as many frames at most
 _INTERRUPTION = 4  # frames; where the view is back after no more than these, it was a flash or a damaged frame
 
 _SPANS = (4, 8)  # frames from the middle of a dissolve to what is compared before and after
@@ -51,12 +49,12 @@ class ShotUpdate:
 
     Attributes:
         index: frames pushed before this one.
-        shot: number of the shot that the frame belongs to, from 0; None where it is blank or, in the second half of a
-            dissolve, shows two. A new shot has a number of its own. After an interruption of at most four frames the
-            old number comes back, and the number that the interruption had is void.
+        shot: number of the shot that the frame belongs to, from 0; None where it is blank or nearly, or shows two in
+            the second half of a dissolve. A new shot has a number of its own. After an interruption of at most four
+            frames the old number comes back, and the number that the interruption had is void.
         starts: whether this is the first frame of a new shot.
         dissimilarity: to the last frame that was not blank, about 0 to 1; NaN where there is nothing to compare.
-        reason: one sentence on a beginning, a return or a blank frame; empty where the shot just goes on.
+        reason: one sentence on a beginning, a return or a frame without a shot; empty where the shot just goes on.
     """
 
     index: int
@@ -70,7 +68,6 @@ class ShotUpdate:
 class _Shot:
     number: int
     end: int  # its last frame
-    view: View
     history: deque[float] = field(default_factory=lambda: deque(maxlen=_HISTORY))
     recent: deque[View] = field(default_factory=lambda: deque(maxlen=2 * max(_SPANS) + 1))  # without a gap
     blended: int = 0  # frames in a row that end a dissolve
@@ -79,7 +76,8 @@ class _Shot:
     def clear(self) -> tuple[View, int]:
         """The newest view that has not faded, and how many frames came since."""
         contrasts = [view.contrast for view in self.recent]
-        place = max(k for k, contrast in enumerate(contrasts) if contrast >= _CLEAR * max(contrasts))
+        enough = min(_CLEAR, _CLEAR_SHARE * max(contrasts))
+        place = max(k for k, contrast in enumerate(contrasts) if contrast >= enough)
         return self.recent[place], len(contrasts) - 1 - place
 
     def threshold(self, gap: int) -> float:
@@ -148,18 +146,20 @@ class CutDetector:
         index, self._pushed = self._pushed, self._pushed + 1
         view = View.of(image)
         textured, blocks = int(view.textured.sum()), len(view.textured)
-        if textured < _BLANK * blocks or self._is_fading_in(index, textured):
+        if textured < _BLANK * blocks:
             return ShotUpdate(index, None, False, float("nan"), f"blank: {textured} of {blocks} blocks show texture")
+        if self._has_faded(index, view):
+            return ShotUpdate(index, None, False, float("nan"), f"faded: contrast {view.contrast:.1f} grey levels")
         if self._shot is None:
             return self._begin(index, view, float("nan"), "first frame that shows something")
         return self._compare(index, view, self._shot)
 
-    def _is_fading_in(self, index: int, textured: int) -> bool:
-        """Whether, after a gap, there is too little to see yet to tell whether it is the same view."""
+    def _has_faded(self, index: int, view: View) -> bool:
+        """Whether too little is left, or back, to tell whether it is the same view."""
         shot = self._shot
-        if shot is None or not (gap := index - shot.end - 1) or gap > _FADE:
+        if shot is None or view.contrast >= _FADED or index - shot.end > _FADE:
             return False
-        return textured < _FADED_IN * int(shot.view.textured.sum())
+        return view.contrast < _CLEAR_SHARE * shot.clear()[0].contrast
 
     def _compare(self, index: int, view: View, shot: _Shot) -> ShotUpdate:
         if (before := self._interrupted) is not None:
@@ -168,13 +168,13 @@ class CutDetector:
             if gap > _INTERRUPTION:
                 self._interrupted = None
             elif (back := dissimilarity(reference, view)) < before.threshold(gap + age):
-                before.end, before.view = index, view
+                before.end = index
                 before.recent.clear()
                 before.recent.append(view)
                 self._shot, self._interrupted = before, None
                 return ShotUpdate(index, before.number, False, back, f"the view is back after {gap} other frames")
         gap = index - shot.end - 1
-        reference, age = shot.clear() if gap else (shot.view, 0)
+        reference, age = shot.clear()
         difference, threshold = dissimilarity(reference, view), shot.threshold(gap + age)
         if difference < threshold:
             return self._go_on(index, view, shot, difference, gap)
@@ -184,7 +184,7 @@ class CutDetector:
 
     def _go_on(self, index: int, view: View, shot: _Shot, difference: float, gap: int) -> ShotUpdate:
         shot.history.append(difference)
-        shot.end, shot.view = index, view
+        shot.end = index
         if gap:
             shot.recent.clear()
         shot.recent.append(view)
@@ -199,7 +199,7 @@ class CutDetector:
         return ShotUpdate(index, shot.number, False, difference)
 
     def _begin(self, index: int, view: View, difference: float, reason: str) -> ShotUpdate:
-        self._shot = _Shot(self._shots, index, view)
+        self._shot = _Shot(self._shots, index)
         self._shot.recent.append(view)
         self._shots += 1
         return ShotUpdate(index, self._shot.number, True, difference, reason)

@@ -75,8 +75,8 @@ def test_hard_cuts_are_found_at_the_exact_frame():
 def test_a_fade_ends_one_shot_and_begins_another(frames, blank):
     first, second = find_shots(fade(shot(0, 20), shot(1, 20), frames, blank))
     assert first.start == 0
-    assert 20 - max(1, frames // 8) <= first.stop <= 19  # the 20th frame is blank
-    assert 20 <= second.start <= 20 + frames // 8
+    assert 20 - max(1, frames // 6) <= first.stop <= 19  # the 20th frame is blank
+    assert 20 <= second.start <= 20 + frames // 6
     assert second.stop == 40
 
 
@@ -299,8 +299,8 @@ def test_every_fade_between_two_shots_is_found(shared_data, blank):
     for (_, before), (after, _) in itertools.permutations(small, 2):
         first, second = find_shots(fade(before, after, 12, blank))
         assert first.start == 0
-        assert first.stop in (6, 7)  # number 7 is blank
-        assert second.start in (8, 9)
+        assert first.stop in (5, 6, 7)  # number 7 is blank, and those beside it nearly
+        assert second.start in (8, 9, 10)
         assert second.stop == 16
 
 
