@@ -14,7 +14,6 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.camera import guess_camera
 from factorsfm.errors import InputError
 from factorsfm.frames import Frame, read_frames
 from factorsfm.image_set import ImageSet
@@ -89,19 +88,12 @@ def _from_shot(
     options: Options,
     progress: Progress | None,
 ) -> Reconstruction:
-    iterator = read_frames(source, frames)
-    if camera is None:
-        options = options.for_unknown_lens()
-    stream: Stream | None = None
-    for done, frame in enumerate(iterator):
-        if stream is None:
-            if camera is None:
-                camera = guessed_camera(source, frame)
-            stream = Stream(camera, depth=depth, masks=masks, options=options)
+    stream = Stream(camera, depth=depth, masks=masks, options=options)
+    for done, frame in enumerate(read_frames(source, frames)):
         if progress is not None:
             progress("frames", done, None)
         stream.push(frame)
-    if stream is None:
+    if not stream.frames:
         raise InputError(f"no frames in {source}")
     check_matched(source, depth, masks)
     return stream.finish(progress)
@@ -125,8 +117,7 @@ def _from_images(
             if progress is not None:
                 progress("images", done, None)
             if isinstance(image, Frame):
-                path = Path(source) / image.name if isinstance(source, str | Path) and Path(source).is_dir() else None
-                images.add(image, path)
+                images.add(image)
             else:
                 images.leave_out(image.index, image.name, image.reason)
         result = images.finish(progress)
@@ -148,10 +139,3 @@ def check_matched(source: object, depth: DepthPrior | None, masks: MaskPrior | N
     for name, folder in (("depth map", depth), ("mask", masks)):
         if isinstance(folder, DepthFolder | MaskFolder) and folder.asked and not folder.matched:
             raise InputError(f"no {name} in the given folder matches a frame of {source}")
-
-
-def guessed_camera(source: object, frame: Frame) -> pycolmap.Camera:
-    """EXIF of the first image of a folder, else the documented guess."""
-    height, width = frame.image.shape[:2]
-    image = Path(source) / frame.name if isinstance(source, str | Path) and Path(source).is_dir() else None
-    return guess_camera(width, height, image)

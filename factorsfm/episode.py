@@ -48,6 +48,8 @@ class Episode(Closing):
     Args:
         camera: the lens of all shots; None guesses it for each.
         depth, masks, options: see `Stream`.
+        finished: called with each result as soon as it is there, in order of time, from a thread of its own; what it
+            raises is raised by `finish`.
 
     Example:
         >>> episode = factorsfm.Episode(depth=factorsfm.DepthModel("model.onnx"))  # doctest: +SKIP
@@ -64,7 +66,9 @@ class Episode(Closing):
         depth: DepthPrior | None = None,
         masks: MaskPrior | None = None,
         options: Options | None = None,
+        finished: Callable[[ShotResult], None] | None = None,
     ) -> None:
+        self._finished = finished
         self._camera, self._depth, self._masks, self._options = camera, depth, masks, options
         self._detector = CutDetector()
         self._streams: dict[int, Stream] = {}
@@ -96,7 +100,7 @@ class Episode(Closing):
         if len(stream.frames) == _CERTAIN:
             for number in sorted(self._streams):
                 if number < self._shot:
-                    self._results.append(self._worker.submit(_finish, self._streams.pop(number), None))
+                    self._results.append(self._worker.submit(self._finish, self._streams.pop(number), None))
         return replace(update, shot=self._shot)
 
     @property
@@ -107,7 +111,7 @@ class Episode(Closing):
     def finish(self, progress: Callable[[str, int, int | None], None] | None = None) -> list[ShotResult]:
         """Polish what is not polished yet; all shots in order of time."""
         self._results += [
-            self._worker.submit(_finish, self._streams.pop(number), progress) for number in sorted(self._streams)
+            self._worker.submit(self._finish, self._streams.pop(number), progress) for number in sorted(self._streams)
         ]
         self._worker.shutdown()
         return [result.result() for result in self._results]
@@ -118,10 +122,12 @@ class Episode(Closing):
         for stream in self._streams.values():
             stream.close()
 
-
-def _finish(stream: Stream, progress: Callable[[str, int, int | None], None] | None) -> ShotResult:
-    first, last = stream.frames[0].index, stream.frames[-1].index
-    try:
-        return ShotResult(first, last, stream.finish(progress))
-    except ReconstructionError as error:
-        return ShotResult(first, last, None, str(error), error.frames)
+    def _finish(self, stream: Stream, progress: Callable[[str, int, int | None], None] | None) -> ShotResult:
+        first, last = stream.frames[0].index, stream.frames[-1].index
+        try:
+            result = ShotResult(first, last, stream.finish(progress))
+        except ReconstructionError as error:
+            result = ShotResult(first, last, None, str(error), error.frames)
+        if self._finished is not None:
+            self._finished(result)
+        return result

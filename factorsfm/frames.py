@@ -43,6 +43,7 @@ class Frame:
         name: file name, or the zero-padded index for videos and iterables.
         timestamp: seconds from the start of the video, None where unknown.
         dropped: frames of a live source that were skipped right before this one, because nobody was ready for them.
+        path: the image file, whose EXIF data may tell the lens; None where there is none.
     """
 
     index: int
@@ -50,6 +51,7 @@ class Frame:
     name: str
     timestamp: float | None = None
     dropped: int = 0
+    path: Path | None = None
 
 
 def parse_range(text: str) -> slice:
@@ -210,7 +212,7 @@ def _natural_key(path: Path) -> tuple[list[str | int], str]:
 
 def _folder_frames(paths: list[Path], selection: slice) -> Iterator[Frame]:
     for index in range(len(paths))[selection]:
-        yield Frame(index, read_image(paths[index]), paths[index].name)
+        yield Frame(index, read_image(paths[index]), paths[index].name, path=paths[index])
 
 
 def watch_folder(folder: Path, end_file: str | Path | None, closed: threading.Event) -> Iterator[Frame]:
@@ -239,7 +241,7 @@ def watch_folder(folder: Path, end_file: str | Path | None, closed: threading.Ev
                 logger.warning("image %s is left out: %s", path, cause)
                 continue
             last = path
-            yield Frame(index, image, path.name)
+            yield Frame(index, image, path.name, path=path)
             index += 1
         else:
             if complete:

@@ -88,6 +88,7 @@ class ImageSet:
         options: Options | None = None,
     ) -> None:
         self.camera = camera
+        self._lens_given = camera is not None
         options = options or Options()
         if camera is None:
             options = options.for_unknown_lens()
@@ -102,11 +103,8 @@ class ImageSet:
         self._known: dict[str, int] = {}
         (folder / "images").mkdir(parents=True, exist_ok=True)
 
-    def add(self, frame: Frame, path: Path | None = None) -> None:
+    def add(self, frame: Frame) -> None:
         """Take an image.
-
-        Args:
-            path: its file, whose EXIF data may tell the focal length.
 
         Raises:
             InputError: it is no image, or a mask fails on it; the set can go on with other images.
@@ -134,8 +132,8 @@ class ImageSet:
                         self._folder / "masks" / f"{photo.file}.png", np.where(ignored, 0, 255).astype(np.uint8)
                     )
             self.photos.append(photo)
-            if self.camera is None and path is not None:
-                guess = guess_camera(width, height, path)
+            if self.camera is None and frame.path is not None:
+                guess = guess_camera(width, height, frame.path)
                 if guess.has_prior_focal_length:
                     self._focal_ratios.append(guess.focal_length / max(width, height))
 
@@ -194,6 +192,7 @@ class ImageSet:
             pixels,
             colors,
             camera,
+            lens_given=self._lens_given,
             prior_given=self._depth is not None,
             metric=self._depth is not None and self._depth.kind is DepthKind.METRIC,
             seconds=dict(self.seconds),

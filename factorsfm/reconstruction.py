@@ -135,6 +135,7 @@ class FrameResult:
 
     @property
     def registered(self) -> bool:
+        """Whether the frame has a pose."""
         return self.cam_from_world is not None
 
 
@@ -186,6 +187,7 @@ class Reconstruction:
 
     @property
     def registered(self) -> list[FrameResult]:
+        """The frames that have a pose."""
         return [frame for frame in self.frames if frame.registered]
 
     def camera_centers(self) -> NDArray[np.float64]:

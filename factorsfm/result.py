@@ -41,6 +41,7 @@ def assemble(
     colors: NDArray[np.uint8],
     camera: pycolmap.Camera,
     *,
+    lens_given: bool,
     prior_given: bool,
     metric: bool,
     seconds: dict[str, float],
@@ -51,12 +52,19 @@ def assemble(
     Args:
         pixels: keypoints (pixels, centres at integers) of each frame, in the order of its track ids.
         colors: RGB by track id.
+        lens_given: whether the camera is known, and no guess.
         prior_given: whether there is a depth prior at all; metric: whether its unit is the metre.
     """
     has_depth = any(image.tracks.depth is not None for image in images)
     state, notes = polished.state, _notes(polished, has_depth)
     if prior_given and not has_depth:
         notes.append("The depth prior took no part: no frame that needed it has a usable depth map.")
+    if polished.lens is None and not lens_given:
+        origin = "that of the EXIF data" if camera.has_prior_focal_length else "a guess"
+        pixels_long = f"{camera.mean_focal_length():.0f} pixels"
+        notes.append(
+            f"The focal length is {origin} ({pixels_long}): no camera was given, and the lens was to stay fixed."
+        )
     scale = _metric_scale(polished, images) if metric else None
     unit = scale or 1.0
     lens = polished.lens

@@ -77,6 +77,7 @@ class RawFormat:
 
     @property
     def frame_bytes(self) -> int:
+        """Size of one frame, bytes."""
         return int(self.width * self.height * _BYTES_PER_PIXEL[self.pixels])
 
     def image(self, data: bytes | bytearray) -> NDArray[np.uint8]:

@@ -48,7 +48,7 @@ from factorsfm.tracks.flow import BLANK_TEXTURE, FlowTracker
 
 logger = logging.getLogger(__name__)
 
-_STATE = ("_size", "_colors", "_pixels", "_without_depth")
+_STATE = ("_size", "_lens_given", "_colors", "_pixels", "_without_depth")
 _REVIVAL_INTERVAL = 5  # frames
 
 
@@ -66,7 +66,8 @@ class Stream(Closing):
     """Incremental reconstruction of one shot.
 
     Args:
-        camera: the lens; None guesses a field of view at the first frame and refines it in `finish`.
+        camera: the lens; None takes EXIF of the first frame's file or guesses a field of view, and refines it in
+            `finish`.
         depth: prior, or None.
         masks: what to ignore, or None.
         options: see `Options`; None is the default preset.
@@ -87,6 +88,7 @@ class Stream(Closing):
         options: Options | None = None,
     ) -> None:
         self.camera = camera
+        self._lens_given = camera is not None
         self.options = options or Options()
         self.seconds: dict[str, float] = defaultdict(float)
         self.frames: list[SeenFrame] = []
@@ -263,6 +265,7 @@ class Stream(Closing):
             self._pixels,
             self._colors,
             self.camera,
+            lens_given=self._lens_given,
             prior_given=self._depth is not None,
             metric=self._depth is not None and self._depth.kind is DepthKind.METRIC,
             seconds=dict(self.seconds),
@@ -309,7 +312,7 @@ class Stream(Closing):
         """Everything that waits for the size of the first frame."""
         height, width = frame.image.shape[:2]
         if self.camera is None:
-            self.camera = guess_camera(width, height)
+            self.camera = guess_camera(width, height, frame.path)
             self.options = self.options.for_unknown_lens()
         check_camera(self.camera, width, height)
         if self.options.refine_focal_length:

@@ -8,13 +8,14 @@ import math
 import signal
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
-from factorsfm.api import check_matched, guessed_camera
+from factorsfm.api import check_matched
 from factorsfm.camera import camera_to_json, read_camera
 from factorsfm.episode import Episode, ShotResult
 from factorsfm.errors import InputError, ReconstructionError
@@ -112,16 +113,18 @@ def run(arguments: argparse.Namespace, progress: Progress, show: Show) -> str:
             stall_seconds=arguments.stall_seconds,
         ) as source:
             target: Stream | Episode | None = resumed
+            end = _End(arguments, source, begin)
             incoming = _after(source, resumed, arguments.source) if resumed is not None else source
             with _first_interrupt() as interrupt:
                 line = _Line(show, source, arguments.cuts)
                 for frame in interrupt.until(incoming):
                     if target is None:
-                        if camera is None:
-                            camera = guessed_camera(arguments.source, frame)
-                            options = options.for_unknown_lens()
-                        kind = Episode if arguments.cuts else Stream
-                        target = kind(camera, depth=watched, masks=masks, options=options)
+                        given: dict[str, Any] = {"depth": watched, "masks": masks, "options": options}
+                        target = (
+                            Episode(camera, finished=end.write_shot, **given)
+                            if arguments.cuts
+                            else Stream(camera, **given)
+                        )
                     start = time.perf_counter()
                     update = target.push(frame)
                     line.tell(update, time.perf_counter() - start)
@@ -134,10 +137,9 @@ def run(arguments: argparse.Namespace, progress: Progress, show: Show) -> str:
         if isinstance(target, Stream) and arguments.snapshot:
             _save(target, arguments.snapshot)
         check_matched(arguments.source, depth, masks)
-        end = _End(arguments, source, begin)
         with target:
             if isinstance(target, Episode):
-                return end.write_shots(target.finish(progress), progress)
+                return end.conclude(target.finish(progress))
             return end.write(target, viewer, progress)
 
 
@@ -172,6 +174,7 @@ class _End:
         self._output: Path = arguments.output
         self._source = source
         self._begin = begin
+        self._said: list[str] = []  # of the shots of a film
         self._given = {k: v for k, v in vars(arguments).items() if k not in ("command", "output", "verbose")}
         if "://" in arguments.source:  # it may hold a password
             self._given["source"] = source.name
@@ -187,20 +190,21 @@ class _End:
         write_folder(self._completed(reconstruction), self._output)
         return conclusion(reconstruction, self._output)
 
-    def write_shots(self, shots: list[ShotResult], progress: Progress) -> str:
-        lines = []
-        for number, shot in enumerate(shots, 1):
-            progress("writing", number, len(shots))
-            folder = self._output / f"shot-{number:03d}"
-            if shot.reconstruction is None:
-                write_failure(folder, shot.reason, shot.frames, self._given, self._seconds())
-            else:
-                write_folder(self._completed(shot.reconstruction), folder)
-            said = verdict(shot.reconstruction) if shot.reconstruction else f"not reconstructed: {shot.reason}"
-            lines.append(f"{folder.name}, frames {shot.first} to {shot.last}: {said}.")
+    def write_shot(self, shot: ShotResult) -> None:
+        """Write what has become of the next shot of a film."""
+        folder = self._output / f"shot-{len(self._said) + 1:03d}"
+        if shot.reconstruction is None:
+            write_failure(folder, shot.reason, shot.frames, self._given, self._seconds())
+        else:
+            write_folder(self._completed(shot.reconstruction), folder)
+        said = verdict(shot.reconstruction) if shot.reconstruction else f"not reconstructed: {shot.reason}"
+        self._said.append(f"{folder.name}, frames {shot.first} to {shot.last}: {said}.")
+
+    def conclude(self, shots: Sequence[ShotResult]) -> str:
+        """What to say of the shots of a film, all of which have been written."""
         if not any(shot.reconstruction for shot in shots):
-            raise ReconstructionError(f"none of {len(shots)} shots could be reconstructed; {lines[0]}")
-        return "\n".join([*lines, f"Results in {self._output}"])
+            raise ReconstructionError(f"none of {len(shots)} shots could be reconstructed; {self._said[0]}")
+        return "\n".join([*self._said, f"Results in {self._output}"])
 
     def _completed(self, reconstruction: Reconstruction) -> Reconstruction:
         if self._source.broke_off:

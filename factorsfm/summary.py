@@ -108,9 +108,10 @@ def pooled_observability(reconstruction: Reconstruction) -> dict[str, float] | N
     cameras = [asdict(f.observability) for f in reconstruction.frames if f.observability is not None]
     if not cameras:
         return None
-    # The median of shares that do not exist is NaN.
-    pooled = {name: float(np.median([camera[name] for camera in cameras])) for name in cameras[0]}
-    return {**pooled, "largest_pixel_slide": max(camera["pixel_slide"] for camera in cameras)}
+    columns = {name: np.array([camera[name] for camera in cameras]) for name in cameras[0]}
+    known = {name: values[np.isfinite(values)] for name, values in columns.items()}  # a camera may see no point
+    pooled = {name: float(np.median(values)) if len(values) else math.nan for name, values in known.items()}
+    return {**pooled, "largest_pixel_slide": max(known["pixel_slide"], default=math.nan)}
 
 
 def with_total(seconds: Mapping[str, float]) -> dict[str, float]:

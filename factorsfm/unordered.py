@@ -53,7 +53,7 @@ def read_images(
         paths = list_images(folder)
         for index in range(len(paths))[frames or slice(None)]:
             try:
-                yield Frame(index, read_image(paths[index]), paths[index].name)
+                yield Frame(index, read_image(paths[index]), paths[index].name, path=paths[index])
             except InputError as error:
                 yield Unusable(index, paths[index].name, str(error).replace(str(paths[index]), paths[index].name))
         return

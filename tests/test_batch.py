@@ -139,6 +139,29 @@ def test_another_film_in_its_place_is_done_anew(tmp_path: Path, film: Path, batc
     assert batch() == 0
     (entry,) = index(tmp_path / "out")["results"]
     assert (entry["frames"], entry["registered"]) == ([0, FRAMES], FRAMES)
+    # Nothing is left of the shots that the old one had, and what is no result is not touched.
+    assert [path.name for path in (tmp_path / "out" / "film").iterdir()] == ["shot_001"]
+    (tmp_path / "out" / "film" / "shot_002").mkdir()
+    (tmp_path / "out" / "film" / "shot_002" / "comp.nk").touch()
+    film.write_bytes(b"not while it is being copied")
+    assert batch() == 2
+    assert (entry_folder := tmp_path / "out" / "film" / "shot_001").is_dir()
+    write_video(film, rendered("dolly").images)
+    assert batch() == 0
+    assert {path.name for path in (tmp_path / "out" / "film").iterdir()} == {"shot_001", "shot_002"}
+    assert json.loads((entry_folder / "summary.json").read_text())["registered"] == FRAMES
+
+
+def test_the_results_of_another_source_are_refused(
+    tmp_path: Path, batch: Run, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = write_video(tmp_path / "other.mp4", [lonely()])
+    assert batch(source=other) == 3
+    capsys.readouterr()
+    before = written(tmp_path / "out")
+    assert batch() == 2
+    assert_error(capsys.readouterr(), "out holds the shots of", "other.mp4, not of", "film.mp4; choose a new or empty")
+    assert written(tmp_path / "out") == before
 
 
 def test_a_folder_of_videos(tmp_path: Path, batch: Run, capsys: pytest.CaptureFixture[str]) -> None:

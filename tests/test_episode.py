@@ -1,5 +1,7 @@
 """A film of several shots: each its own reconstruction."""
 
+import threading
+
 import cv2
 import numpy as np
 import pytest
@@ -33,6 +35,34 @@ def test_a_hard_cut_gives_two_reconstructions():
         assert len(shot.reconstruction.registered) == FRAMES
         assert [frame.index for frame in shot.reconstruction.frames] == list(range(shot.first, shot.last + 1))
     assert first.reconstruction.kind is ShotKind.GENERAL
+
+
+def test_each_result_is_told_as_soon_as_it_is_there():
+    told: list[ShotResult] = []
+    there = threading.Event()
+
+    def take(shot: ShotResult) -> None:
+        told.append(shot)
+        there.set()
+
+    episode = Episode(rendered("dolly").camera, options=OPTIONS, finished=take)
+    for image in [*rendered("dolly").images, *other()]:
+        episode.push(image)
+    assert there.wait(60)
+    assert [shot.first for shot in told] == [0]  # before the end of the film
+    shots = episode.finish()
+    assert len(shots) == 2
+    assert all(shot is its for shot, its in zip(shots, told, strict=True))
+
+
+def test_what_a_listener_raises_comes_out_at_the_end():
+    def full(shot: ShotResult) -> None:
+        raise OSError("disk full")
+
+    episode = Episode(rendered("dolly").camera, options=OPTIONS, finished=full)
+    episode.push(rendered("dolly").images[0])
+    with pytest.raises(OSError, match="disk full"):
+        episode.finish()
 
 
 def test_a_fade_gives_two_reconstructions():

@@ -289,7 +289,7 @@ def test_failure_writes_only_the_reason(tmp_path: Path) -> None:
     write_folder(build(), out)
     write_failure(out, "no texture", build().frames, {"preset": "default"}, {"tracking": 1.0})
     assert {p.name for p in out.iterdir()} == {"summary.json", "report.html"}
-    assert "could not be solved: no texture." in (out / "report.html").read_text(encoding="utf-8")
+    assert "No texture." in (out / "report.html").read_text(encoding="utf-8")
     summary = json.loads((out / "summary.json").read_text())
     assert (summary["reconstructed"], summary["reason"]) == (False, "no texture")
     assert (summary["frames"], summary["options"]) == (6, {"preset": "default"})

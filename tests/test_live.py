@@ -5,9 +5,11 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from rendered import FRAMES, Maps, quick_presets, rendered, simulated_maps, with_fewer_tracks
+from test_camera import jpeg_with_focal_length
 
 import factorsfm
 from factorsfm import Frame, FrameStatus, FrameUpdate, InputError, Options, RawFormat, ReconstructionError, Stream
+from factorsfm.camera import guess_camera
 from factorsfm.synthetic import RenderedShot, render_shot, simulate_prior
 
 BLACK = np.zeros((180, 320, 3), np.uint8)
@@ -39,6 +41,17 @@ def test_every_frame_gives_an_update_and_the_end_is_that_of_the_one_call():
 def test_a_part_of_the_source():
     with follow(rendered("dolly").images, frames=slice(1, 6, 2), preset="geometry", depth="no such network") as live:
         assert [update.index for update in live] == [1, 3, 5]
+
+
+def test_the_lens_comes_from_exif_of_the_images(tmp_path):
+    for index in (1, 2):
+        jpeg_with_focal_length(tmp_path / f"{index}.jpg", 35)
+    with factorsfm.track(tmp_path, depth=None, preset="geometry") as live:
+        next(live)
+        camera = live.stream.camera
+    assert camera.has_prior_focal_length
+    assert camera.focal_length == guess_camera(480, 270, tmp_path / "1.jpg").focal_length
+    assert live.stream.options.lens == "distortion"
 
 
 def test_a_source_that_breaks_off_leaves_what_came():

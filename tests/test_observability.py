@@ -419,3 +419,11 @@ def test_shares_that_do_not_exist_are_null():
     status = json.loads(json_text(failure_summary("", frames, {}, {})))["statuses"][0]
     assert status["observability"]["prior_share"] is None
     assert np.isnan(pooled_observability(SimpleNamespace(frames=frames))["prior_share"])
+
+
+def test_a_camera_without_observations_is_left_out_of_the_pool():
+    known = registered(cameras([0.1, 0.3], share=0.3, angle=0.5, slide=[0.1, 0.3]))
+    blind = registered(cameras([np.nan], share=np.nan, angle=np.nan, slide=[np.nan]))
+    pooled = pooled_observability(SimpleNamespace(frames=blind + known))
+    assert pooled == pooled_observability(SimpleNamespace(frames=known))
+    assert pooled["largest_pixel_slide"] == 0.3

@@ -103,6 +103,17 @@ def test_without_a_ground_the_wall_is_taken_and_no_cut_through_it() -> None:
     np.testing.assert_allclose(normal, [0, 0, -1], atol=0.01)
 
 
+def test_a_ground_with_few_points_is_preferred_to_a_wall_and_to_a_table() -> None:
+    rng = np.random.default_rng(0)
+    table = np.column_stack([rng.uniform(-1, 1, 60), np.full(60, 0.4), rng.uniform(3, 5, 60)])
+    points = np.concatenate([floor_and_clutter(floor=60, clutter=80, wall=500), table])
+    assert find_plane(solved(points)).kind == "ground"
+    assert np.isin(np.arange(60), find_plane(solved(points)).support).mean() > 0.9
+    # A table alone is none: a good share of the points lies below it.
+    points = np.concatenate([floor_and_clutter(floor=0, clutter=0, wall=500), table])
+    assert find_plane(solved(points)).kind == "plane"
+
+
 def test_without_any_plane_there_is_one_at_the_median_distance() -> None:
     reconstruction = solved(floor_and_clutter(floor=0, clutter=200))
     plane = find_plane(reconstruction)

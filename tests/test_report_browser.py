@@ -207,8 +207,8 @@ def test_a_failed_shot(report: Report) -> None:
     report.open(failure_html("14 of 30 inliers needed", frames, {}, {}))
     assert report.run("getComputedStyle(document.body).backgroundColor") == "rgb(246, 246, 244)"
     assert report.hidden("scene_card", "depth_section", "footage_card", "charts_section") == [True, True, False, False]
-    assert "could not be solved: 14 of 30 inliers needed." in report.run(
-        "document.querySelector('.verdict').textContent"
+    assert report.run("document.querySelector('.explanation').textContent") == (
+        "6 frames: tracks contradict the scene. 14 of 30 inliers needed."
     )
     assert report.filled("footage") == 1
     before = report.digest("footage")

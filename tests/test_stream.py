@@ -186,6 +186,20 @@ class Failing(Maps):
         return super().__call__(frame)
 
 
+def test_a_lens_that_is_guessed_and_stays_so_is_said_to_be_a_guess():
+    images = rendered("dolly").images
+    fixed = replace(QUICK, lens="fixed")
+    guessed = stream(camera=None, options=fixed)
+    given = stream(options=fixed)
+    for image in images:
+        guessed.push(image)
+        given.push(image)
+    assert "The focal length is a guess (343 pixels): no camera was given, and the lens was to stay fixed." in (
+        guessed.finish().notes
+    )
+    assert not any("focal length" in note for note in given.finish().notes)
+
+
 def test_a_depth_network_that_raises_at_once_is_named_with_the_frame():
     s = stream(depth=Failing({0}))
     with pytest.raises(ModelError, match=r"depth prior failed on frame 0: RuntimeError\('out of memory'\)"):

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 import logging
+import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from factorsfm.batch.plan import Job, Method, Video, find_videos, plan_jobs
 from factorsfm.batch.worker import Progress, find_shots_of, reconstruct_shot
 from factorsfm.camera import read_camera
 from factorsfm.errors import FactorsfmError, InputError, ReconstructionError
-from factorsfm.export.folder import check_directory, write_failure
+from factorsfm.export.folder import check_directory, is_earlier_result, write_failure
 from factorsfm.options import Options
 from factorsfm.priors.depth import open_depth
 from factorsfm.priors.masks import open_masks
@@ -53,7 +54,7 @@ def run(arguments: argparse.Namespace, progress: Progress, show: Show) -> str:
         raise InputError("--workers and --scheduler cannot be combined: a cluster has its own workers")
     source, output = Path(arguments.source), arguments.output
     videos = find_videos(source)
-    known = shots_known(output)
+    known = shots_known(output, source)
     method = _method(arguments, several=source.is_dir())
     workers = arguments.workers or 1
     alone = workers == 1 and not arguments.scheduler
@@ -62,6 +63,7 @@ def run(arguments: argparse.Namespace, progress: Progress, show: Show) -> str:
         jobs = plan_jobs(shots, method, output, several=source.is_dir())
         for job in jobs:
             check_directory(job.folder)
+        _remove_others(output, jobs, unread)
         index = Index(source, output, shots, unread, jobs)
         work = partial(reconstruct_shot, one_thread=not alone, progress=progress if alone else None)
         _reconstruct(crew, work, jobs, index, show)
@@ -127,6 +129,19 @@ def _reconstruct(crew: Crew, work: Callable[[Job], None], jobs: Sequence[Job], i
         index.add(job)
         index.write()
         line.tell(job)
+
+
+def _remove_others(output: Path, jobs: Sequence[Job], unread: Collection[Video]) -> None:
+    """Remove results that an earlier run left and that are none of these jobs: of a video that had more shots.
+
+    Those of a video that cannot be read now stay.
+    """
+    kept = {job.folder for job in jobs}
+    unreadable = {video.name for video in unread}
+    for folder in output.absolute().glob("*/shot_*"):
+        if folder not in kept and folder.parent.name not in unreadable and is_earlier_result(folder):
+            logger.info("%s is removed: the video has no such shot any more", folder)
+            shutil.rmtree(folder)
 
 
 class _Line:

@@ -9,7 +9,6 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from html import escape
-from importlib.resources import files
 from pathlib import Path
 from string import Template
 from typing import Any
@@ -21,6 +20,7 @@ import numpy as np
 from factorsfm.batch.plan import Job, Video
 from factorsfm.errors import InputError
 from factorsfm.export.folder import check_directory
+from factorsfm.report.document import document, packaged
 from factorsfm.report.wording import grade_of
 from factorsfm.summary import PROGRAM, json_text, program_version
 
@@ -124,7 +124,7 @@ class Index:
         return {
             "program": PROGRAM,
             "version": program_version(),
-            "source": self._source,
+            "source": self._source.absolute(),
             **self._totals(),
             "videos": [
                 {**video.to_dict(), "shots": [[frames.start, frames.stop] for frames in found]}
@@ -156,14 +156,13 @@ class Index:
             "Frames solved": f"{totals['registered']:,}",
             "Computing": _duration(totals["seconds"]),
         }
-        return Template(_file("factorsfm.batch", "index.html")).substitute(
-            title=escape(f"{self._source} – {PROGRAM} shots"),
+        body = Template(packaged("factorsfm.batch", "index.html")).substitute(
             source=escape(str(self._source)),
             verdict=_verdict(totals),
             facts="".join(f"<div><dt>{name}</dt><dd>{value}</dd></div>" for name, value in facts.items()),
             videos="".join(self._video_html(video) for video in (*self._shots, *self._unread)),
-            style=_file("factorsfm.report", "page.css") + _file("factorsfm.batch", "index.css"),
         )
+        return document(f"{self._source} – {PROGRAM} shots", body, styles=packaged("factorsfm.batch", "index.css"))
 
     def _video_html(self, video: Video) -> str:
         entries = [entry for entry in self.entries if entry.folder.rpartition("/")[0] == video.name]
@@ -172,11 +171,11 @@ class Index:
         return f'<section><h2>{escape(video.path.name)}</h2>{reason}<ol class="shots">{rows}</ol></section>'
 
 
-def shots_known(output: Path) -> dict[str, list[range]]:
+def shots_known(output: Path, source: Path) -> dict[str, list[range]]:
     """Shots that an earlier run has found, by the JSON text of `Video.to_dict`; empty if another version did.
 
     Raises:
-        InputError: the folder cannot be written, or holds something else than an earlier run.
+        InputError: the folder cannot be written, or holds something else than an earlier run on this source.
     """
     path = output / "index.json"
     if not path.exists():
@@ -186,6 +185,8 @@ def shots_known(output: Path) -> dict[str, list[range]]:
         content = json.loads(path.read_text(encoding="utf-8"))
         if content["program"] != PROGRAM:
             raise ValueError(content["program"])
+        if (earlier := content["source"]) != str(source.absolute()):
+            raise InputError(f"{output} holds the shots of {earlier}, not of {source}; choose a new or empty folder")
         if content["version"] != program_version():
             return {}
         found = [([range(*pair) for pair in video.pop("shots")], video) for video in content["videos"]]
@@ -252,7 +253,3 @@ def _thumbnail(report: Path) -> bytes | None:
         ".jpg", cv2.resize(image, size, interpolation=cv2.INTER_AREA), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
     )
     return jpeg.tobytes()
-
-
-def _file(package: str, name: str) -> str:
-    return files(package).joinpath(name).read_text(encoding="utf-8")

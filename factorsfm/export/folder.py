@@ -65,7 +65,7 @@ def check_directory(directory: str | Path) -> None:
     """
     directory = Path(directory)
     try:
-        if directory.exists() and any(directory.iterdir()) and not _is_earlier_result(directory):
+        if directory.exists() and any(directory.iterdir()) and not is_earlier_result(directory):
             raise InputError(
                 f"the output folder {directory} is not empty and holds no earlier factorsfm result; "
                 "choose a new or empty folder"
@@ -110,7 +110,8 @@ def _replace_entries(new: Path, directory: Path) -> None:
             (new / name).replace(old)
 
 
-def _is_earlier_result(directory: Path) -> bool:
+def is_earlier_result(directory: Path) -> bool:
+    """Whether a folder holds a result, or the reason why there is none."""
     try:
         content = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):

@@ -42,7 +42,9 @@ function drawChart(chart) {
     element(svg, "text", {x: margin.left - 6, y: y(t * tick) + 4, "text-anchor": "end"}, format(t * tick));
   }
   const every = [1, 2, 5, 10, 20, 25, 50, 100, 200, 500].find(n => last / n <= inner / 45) || Math.ceil(last / 5);
-  for (let k = 0; k < frameCount; k += every) element(svg, "text", {x: x(k), y: height - 4, "text-anchor": "middle"}, data.frame[k]);
+  const name = width - margin.right;
+  element(svg, "text", {x: name, y: height - 4, "text-anchor": "end"}, "frame");
+  for (let k = 0; k < frameCount && (!k || x(k) < name - 48); k += every) element(svg, "text", {x: x(k), y: height - 4, "text-anchor": "middle"}, data.frame[k]);
   data.keyframe.forEach((keyframe, k) => {
     if (keyframe) element(svg, "line", {x1: x(k), x2: x(k), y1: bottom + 1, y2: bottom + 6, stroke: "var(--quiet)"});
   });

@@ -40,7 +40,7 @@ class Chart:
 
 
 def charts(frames: Sequence[FrameResult], prior_residual: NDArray[np.float64], unit: str) -> list[Chart]:
-    """The charts of which at least one number is known.
+    """The charts of which at least one number is known and not 0.
 
     Args:
         prior_residual: (frames,) median magnitude of the relative residual.
@@ -65,7 +65,7 @@ def charts(frames: Sequence[FrameResult], prior_residual: NDArray[np.float64], u
         _chart("Scale of the depth prior, ±1σ", _read(fits, lambda p: p.scale), std=_read(fits, lambda p: p.scale_std)),
         _chart("Shift of the depth prior, ±1σ", _read(fits, lambda p: p.shift), std=_read(fits, lambda p: p.shift_std)),
     ]
-    return [chart for chart in found if np.isfinite(chart.values).any() or np.any(chart.pale > 0)]
+    return [chart for chart in found if np.nan_to_num(chart.values).any() or np.nan_to_num(chart.pale).any()]
 
 
 def short(values: Iterable[float]) -> list[float]:

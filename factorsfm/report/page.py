@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from html import escape
 from importlib.metadata import PackageNotFoundError, version
-from importlib.resources import files
+from itertools import groupby
 from platform import python_version
 from string import Template
 from typing import Any
 
 from factorsfm.reconstruction import FrameResult, Reconstruction
 from factorsfm.report.data import frames_data, reconstruction_data
+from factorsfm.report.document import document, packaged
 from factorsfm.report.wording import (
     explanation,
     failure_sentence,
@@ -46,8 +47,8 @@ def failure_html(
     """The report of a shot that could not be reconstructed: why, and what became of each frame."""
     return _document(
         grade="Not solved",
-        verdict=f"The camera of this shot could not be solved: {reason.rstrip('.')}.",
-        explanation=failure_sentence(frames),
+        verdict="The camera of this shot could not be solved.",
+        explanation=f"{failure_sentence(frames)} {reason[:1].upper()}{reason[1:].rstrip('.')}.",
         notes=[],
         facts={"Frames": len(frames)},
         frames=frames,
@@ -70,8 +71,7 @@ def _document(
     data: Mapping[str, Any],
 ) -> str:
     source = options.get("source")
-    return Template(_file("page.html")).substitute(
-        title=escape(f"{source} – {PROGRAM} report" if source else f"{PROGRAM} report"),
+    body = Template(packaged("factorsfm.report", "page.html")).substitute(
         source=escape(str(source)) if source else "Reconstruction",
         grade=escape(grade),
         mark=grade.lower().replace(" ", "-"),
@@ -83,11 +83,11 @@ def _document(
         timings=_table({stage: f"{value:.2f} s" for stage, value in with_total(seconds).items()}),
         versions=_table(_versions()),
         options=_table(_flat(options)),
-        style=_file("page.css"),
         # "</" would end the script element
         data=json_text(data, indent=None).replace("</", "<\\/"),
-        script="".join(_file(name) for name in _SCRIPTS),
+        script="".join(packaged("factorsfm.report", name) for name in _SCRIPTS),
     )
+    return document(f"{source} – {PROGRAM} report" if source else f"{PROGRAM} report", body, scripted=True)
 
 
 def _facts(reconstruction: Reconstruction) -> dict[str, Any]:
@@ -109,16 +109,22 @@ def _statuses(frames: Sequence[FrameResult]) -> str:
     missing = [frame for frame in frames if not frame.registered]
     if not missing:
         return "<p>Every frame is solved.</p>" if frames else "<p>No frame was read.</p>"
+    alike = [list(group) for _, group in groupby(missing, lambda frame: (frame.status, frame.message))]
     rows = "".join(
-        f"<tr><td>{frame.index}</td><td>{escape(frame.name)}</td>"
-        f"<td>{status_words(frame.status)}</td><td>{escape(frame.message)}</td></tr>"
-        for frame in missing
+        f"<tr><td>{_span(str(group[0].index), str(group[-1].index))}</td>"
+        f"<td>{escape(_span(group[0].name, group[-1].name))}</td>"
+        f"<td>{status_words(group[0].status)}</td><td>{escape(group[0].message)}</td></tr>"
+        for group in alike
     )
     return (
         '<div class="scroll tall" tabindex="0" role="region" aria-label="Frames that are not solved"><table><thead><tr>'
         '<th scope="col">Frame</th><th scope="col">Name</th><th scope="col">Status</th><th scope="col">Reason</th>'
         f"</tr></thead><tbody>{rows}</tbody></table></div>"
     )
+
+
+def _span(first: str, last: str) -> str:
+    return first if first == last else f"{first} to {last}"
 
 
 def _table(values: Mapping[str, Any]) -> str:
@@ -147,7 +153,3 @@ def _flat(options: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
         else:
             flat[f"{prefix}{key}"] = value
     return flat
-
-
-def _file(name: str) -> str:
-    return files("factorsfm.report").joinpath(name).read_text(encoding="utf-8")

@@ -17,7 +17,8 @@ _TRIPLES = 500
 _MAX_POINTS = 4000
 _TOLERANCE = 0.01  # of the distance from the camera, within which a point lies on a plane
 _GROUND_SLOPE = np.cos(np.radians(35))  # between a ground's normal and the camera's vertical
-_GROUND_SHARE, _ANY_SHARE = 0.12, 0.2  # of the points that must support a ground, or any plane
+_GROUND_SHARE, _ANY_SHARE = 0.06, 0.2  # of the points that must support a ground, or any plane
+_BELOW_GROUND = 0.1  # share of the points that may lie clearly below a ground: more are below a table
 _FEWEST = 15
 _BREADTH = 0.12  # of the supporting points across their longest direction: a line supports every plane through it
 _CELL = 0.1  # side of a cell as a share of the picture's width, at most, at the typical distance of the plane
@@ -110,7 +111,12 @@ def find_plane(reconstruction: Reconstruction) -> Plane:
     distance = np.linalg.norm(points, axis=1)
 
     planes = _planes(points, distance)
-    grounds = [plane for plane in planes if -plane[1] @ view[1] > _GROUND_SLOPE]
+    level = [plane for plane in planes if -plane[1] @ view[1] > _GROUND_SLOPE]
+    grounds = [
+        (origin, up, support)
+        for origin, up, support in level
+        if np.mean((points - origin) @ up < -2 * _TOLERANCE * distance) < _BELOW_GROUND
+    ]
     for kind, found, share in (("ground", grounds, _GROUND_SHARE), ("plane", planes, _ANY_SHARE)):
         origin, up, support = max(found, key=lambda plane: len(plane[2]), default=(view[2], view[2], rows[:0]))
         if len(support) >= share * len(rows):

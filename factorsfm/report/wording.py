@@ -60,9 +60,8 @@ def explanation(reconstruction: Reconstruction) -> list[str]:
     known = [frame.observability for frame in reconstruction.registered if frame.observability is not None]
     slide = _largest([item.pixel_slide for item in known])
     if slide is not None:
-        sentences.append(
-            f"An object placed in the scene may slide by up to {slide:.2f} pixels against the footage (1σ)."
-        )
+        most = f"up to {slide:.2f} pixels" if slide >= 0.01 else "less than 0.01 pixels"
+        sentences.append(f"An object placed in the scene may slide by {most} against the footage (1σ).")
     share = _largest([item.prior_share for item in known])
     if share is not None and reconstruction.kind is ShotKind.GENERAL:
         if share < _NO_SHARE:

@@ -1,0 +1,27 @@
+"""What all pages have in common: one HTML file each, with everything inside, that asks nobody for anything."""
+
+from __future__ import annotations
+
+from html import escape
+from importlib.resources import files
+from string import Template
+
+
+def document(title: str, body: str, *, styles: str = "", scripted: bool = False) -> str:
+    """A whole page.
+
+    Args:
+        title: plain text; body: HTML; styles: CSS besides that of all pages.
+        scripted: whether the body has scripts, which are refused otherwise.
+    """
+    return Template(packaged("factorsfm.report", "document.html")).substitute(
+        title=escape(title),
+        script_policy="script-src 'unsafe-inline'; " if scripted else "",
+        style=packaged("factorsfm.report", "page.css") + styles,
+        body=body,
+    )
+
+
+def packaged(package: str, name: str) -> str:
+    """The text of a file that comes with a package."""
+    return files(package).joinpath(name).read_text(encoding="utf-8")
