@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,6 +64,12 @@ class MappedImage:
         if self.rotation is None or self.translation is None:
             raise ValueError(f"image {self.tracks.position} is not registered")
         return self.rotation, self.translation
+
+    def forget(self, status: FrameStatus, message: str) -> None:
+        """Give up all that is known but the tracks, and the prior at them."""
+        blank = MappedImage(self.tracks, status, message)
+        for field in fields(self):
+            setattr(self, field.name, getattr(blank, field.name))
 
 
 def gather(images: Sequence[MappedImage], ids: Index) -> Observations:

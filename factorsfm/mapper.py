@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
 from collections.abc import Callable, Mapping
@@ -15,26 +16,27 @@ from numpy.typing import NDArray
 from factorsfm.factors import camera_points, cross_matrices
 from factorsfm.graph import FactorGraph
 from factorsfm.images import ImageTracks, MappedImage, median_flow, renormalize, shared_tracks
-from factorsfm.initialization import NoStart, Start, start_essential_among, start_flat, start_lifted, start_pair
+from factorsfm.initialization import NoStart, Start
 from factorsfm.map_update import MapCopy, MapUpdate, update_map
 from factorsfm.options import Options
 from factorsfm.point_map import PointMap
 from factorsfm.reconstruction import FrameStatus
 from factorsfm.registration import ImageDepth, Registration, register_image
+from factorsfm.starting import Starter
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 logger = logging.getLogger(__name__)
 
-_PAIR_WINDOW = 10  # images among which the paper's initial pair is sought
 _STATE = (
-    "focal", "keyframes", "new_points", "parallax", "started", "_start_kind", "_waits_for_depth", "_due",
+    "focal", "keyframes", "new_points", "parallax", "started", "_waits_for_depth", "_due",
 )  # fmt: skip
-_LIFT_PATIENCE = 10  # images without a usable depth map after which the start does without
 _DEPTH_PATIENCE = 3  # keyframes without a depth map after which one does without
 _YOUNG_ERROR = 0.8  # relative, of a map that only the prior has shaped; falls with the square of the keyframes
 _LEAST_RELOCALIZED = 0.3  # of the similar corners must agree with the pose
+_NOT_JOINED = (FrameStatus.LOST, FrameStatus.TOO_FEW_INLIERS)
+_PATIENCE, _YOUNG_KEYFRAMES = 5, 2  # images that do not join a map, and its keyframes, with which it is given up
 _RUNNING_OUT = 0.5  # share of an image's tracks with a point, below which the map is extended at once
 _CONSENSUS = 0.8  # share of the inliers of the image before that is enough, however roughly they agree
 _SETTLED, _SETTLED_DELAY = 5, 2  # keyframes of a map that changes little; frames that it waits longer for the graph
@@ -65,9 +67,9 @@ class Mapper:
         self._update: Future[MapUpdate] | None = None
         self._due = 0
         self._advanced = -1  # number of images for which `advance` was called last
-        self._start_kind = self.options.initialization if has_prior else "essential"
+        self._starter = Starter(self.options, has_prior=has_prior)
         self._reads_every_depth = has_prior and (
-            self._start_kind == "pair" or self.options.registration_depth != "none"
+            self._starter.kind == "pair" or self.options.registration_depth != "none"
         )
         self._uses_keyframe_depth = has_prior and options.uses_depth
         self.started = False
@@ -81,6 +83,7 @@ class Mapper:
         update = self._update.result() if self._update is not None else None
         return {
             **{name: getattr(self, name) for name in _STATE},
+            "start_kind": self._starter.kind,
             "images": list(self.images),
             "points": self.points.table,
             "update": update,
@@ -90,6 +93,7 @@ class Mapper:
         """Go on where `state` was taken. The graph is rebuilt from the map at its next update."""
         for name in _STATE:
             setattr(self, name, state[name])
+        self._starter.kind = state["start_kind"]
         self.images = list(state["images"])
         self.points = PointMap(state["points"])
         if state["update"] is not None:
@@ -131,25 +135,28 @@ class Mapper:
             image.status = FrameStatus.TOO_FEW_TRACKS
             image.message = f"{len(image.tracks.ids)} of {self.options.min_tracks} needed tracks"
         elif not self.started:
-            self._try_start(image, read_depth)
+            self._try_start(read_depth)
         else:
-            hurry = self.points.contains(image.tracks.ids).mean() < _RUNNING_OUT
-            if hurry:  # the camera is faster than the graph
+            self._extend(image, read_depth)
+            if not image.registered and self._passed_by():
+                self._start_anew()
+                self._try_start(read_depth)
+
+    def _extend(self, image: MappedImage, read_depth: Callable[[], ImageDepth | None]) -> None:
+        """Register an image, and extend the map where it shows something new."""
+        hurry = self.points.contains(image.tracks.ids).mean() < _RUNNING_OUT
+        if hurry:  # the camera is faster than the graph
+            self._take_over()
+        self._register(image)
+        if image.registered and self._update is None and self._is_keyframe(image):
+            self._add_keyframe(image, read_depth)
+            if hurry:
                 self._take_over()
-            self._register(image)
-            if image.registered and self._update is None and self._is_keyframe(image):
-                self._add_keyframe(image, read_depth)
-                if hurry:
-                    self._take_over()
 
     def finish(self) -> None:
         """No more images: start with what there is, if nothing better came; all images on the map as it is at last."""
-        if not self.started and self._start_kind == "pair":
-            self._begin(self._start_from_pair())
         if not self.started:
-            self._begin(self._start_essential(angle_deg=0.0))
-        if not self.started:
-            self._begin(start_flat([image.tracks for image in self._waiting()]))
+            self._begin(self._starter.last_resort(self._waiting(), self.focal))
         self.refresh()
         self.close()
 
@@ -172,31 +179,8 @@ class Mapper:
     def _waiting(self) -> list[MappedImage]:
         return [image for image in self.images if image.status is FrameStatus.WAITING]
 
-    def _try_start(self, image: MappedImage, read_depth: Callable[[], ImageDepth | None]) -> None:
-        if self._start_kind == "lifted":
-            image.tracks = replace(image.tracks, depth=read_depth())
-            start = start_lifted(image.tracks, self.options.min_tracks)
-            if isinstance(start, NoStart) and len(self._waiting()) >= _LIFT_PATIENCE:
-                logger.warning("no usable depth in %d images, starting without: %s", _LIFT_PATIENCE, start.reason)
-                self._start_kind = "essential"
-        elif self._start_kind == "pair":
-            if len(self._waiting()) < _PAIR_WINDOW:
-                image.message = f"{len(self._waiting())} of {_PAIR_WINDOW} images among which the start is chosen"
-                return
-            start = self._start_from_pair()
-        else:
-            start = self._start_essential(self.options.essential_angle_deg)
-        self._begin(start)
-
-    def _start_from_pair(self) -> Start | NoStart:
-        o = self.options
-        images = [image.tracks for image in self._waiting()]
-        return start_pair(images, o.min_tracks, focal=self.focal, sigma=o.pixel_sigma, inlier_px=o.inlier_px)
-
-    def _start_essential(self, angle_deg: float) -> Start | NoStart:
-        o = self.options
-        waiting = [image.tracks for image in self._waiting()]
-        return start_essential_among(waiting, o.min_tracks, focal=self.focal, sigma=o.pixel_sigma, angle_deg=angle_deg)
+    def _try_start(self, read_depth: Callable[[], ImageDepth | None]) -> None:
+        self._begin(self._starter.try_start(self._waiting(), self.focal, read_depth))
 
     def _begin(self, start: Start | NoStart) -> None:
         if isinstance(start, NoStart):
@@ -223,6 +207,31 @@ class Mapper:
             if image.registered and self._is_keyframe(image):
                 self._add_keyframe(image, None)
                 self._take_over()
+
+    def _passed_by(self) -> bool:
+        """Whether more images have failed to join the map than ever joined it: it shows something else.
+
+        That is a flash or the end of the shot before in front of a shot that was cut too early. A map that has grown is
+        never given up.
+        """
+        joined = sum(image.registered for image in self.images)
+        since = itertools.takewhile(lambda image: not image.registered, reversed(self.images))
+        failed = sum(image.status in _NOT_JOINED for image in since)
+        return len(self.keyframes) <= _YOUNG_KEYFRAMES and failed > max(_PATIENCE, joined)
+
+    def _start_anew(self) -> None:
+        """Forget the map; the images that did not join it wait for another."""
+        self._take_over()
+        joined = sum(image.registered for image in self.images)
+        last = max(k for k, image in enumerate(self.images) if image.registered)
+        logger.warning("the images that follow image %d do not join its map, starting anew", last)
+        for k, image in enumerate(self.images):
+            if k > last and image.status in _NOT_JOINED:
+                image.forget(FrameStatus.WAITING, "waiting for the start of another map")
+            elif image.registered:
+                image.forget(FrameStatus.LOST, f"on a map of {joined} images that none of those that followed joined")
+        self.points, self.graph = PointMap(), FactorGraph()
+        self.keyframes, self.parallax, self.started = [], 0.0, False
 
     # --- registration -------------------------------------------------------------------------------------------
 

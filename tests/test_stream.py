@@ -208,6 +208,22 @@ def test_a_depth_network_that_raises_at_once_is_named_with_the_frame():
     assert {update.status for update in updates} == {FrameStatus.REGISTERED}
 
 
+@pytest.mark.parametrize("foreign", [1, 2])
+def test_a_map_that_the_following_frames_do_not_join_is_given_up(foreign):
+    """A shot that was cut too early begins with the end of the one before."""
+    shot, before = render_shot("dolly", 14, 320, 180), render_shot("truck", 2, 320, 180, seed=5)
+    images = [*before.images[:foreign], *shot.images]
+    s = stream(depth=Maps([*simulate_prior(before)[:foreign], *simulate_prior(shot)]))
+    updates = [s.push(Frame(k, image, str(k))) for k, image in enumerate(images)]
+    assert updates[0].status is FrameStatus.REGISTERED
+    assert updates[-1].status is FrameStatus.REGISTERED
+    result = s.finish()
+    assert [frame.status is FrameStatus.REGISTERED for frame in result.frames] == [False] * foreign + [True] * 14
+    assert "none of those that followed joined" in result.frames[0].message
+    own = replace(result, frames=result.frames[foreign:])
+    assert np.median(errors_of(own, shot).ate) < 0.01
+
+
 @pytest.mark.parametrize("preset", ["default", "paper"])
 def test_a_depth_network_that_raises_later_is_done_without(preset, caplog):
     paper = preset == "paper"
