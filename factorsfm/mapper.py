@@ -209,15 +209,16 @@ class Mapper:
                 self._take_over()
 
     def _passed_by(self) -> bool:
-        """Whether more images have failed to join the map than ever joined it: it shows something else.
+        """Whether more images have failed to join the map than ever joined it, and show one thing themselves.
 
-        That is a flash or the end of the shot before in front of a shot that was cut too early. A map that has grown is
-        never given up.
+        The map is of a flash then, or of the end of the shot before. One that has grown is never given up.
         """
         joined = sum(image.registered for image in self.images)
         since = itertools.takewhile(lambda image: not image.registered, reversed(self.images))
-        failed = sum(image.status in _NOT_JOINED for image in since)
-        return len(self.keyframes) <= _YOUNG_KEYFRAMES and failed > max(_PATIENCE, joined)
+        failed = [image.tracks for image in since if image.status in _NOT_JOINED]
+        if len(self.keyframes) > _YOUNG_KEYFRAMES or len(failed) <= max(_PATIENCE, joined):
+            return False
+        return shared_tracks(failed[0], failed[_PATIENCE]) >= self.options.min_tracks
 
     def _start_anew(self) -> None:
         """Forget the map; the images that did not join it wait for another."""
