@@ -113,7 +113,7 @@ class FrameResult:
         prior: fitted scale and shift of the depth prior, None where the frame carries none.
         covariance: (6, 6) of (rotation vector, translation), a perturbation of `world_from_cam` on the right, relative
             to the first registered camera in the scene's unit of length, which is the mean inverse distance of the
-            points; None where not registered.
+            points; None where not registered, or where no point of the result is seen.
         observability: what carries the pose, None where not registered.
         thumbnail: a small JPEG of the image, None where none is kept.
     """

@@ -46,7 +46,8 @@ class BundleAdjustment:
         lens_sigmas: (4,) standard deviations with which `State.lens` is known beforehand (0: exactly); None: it is
             zero, the observations are undistorted.
         points_only: True holds everything but the points fixed.
-        fixed: (k,) frames whose poses are held; by default the first, which is the world.
+        fixed: (k,) frames whose poses are held; by default the first, which is the world. Those without observations are
+            held as well.
         prior: depth-prior values, or None.
     """
 
@@ -88,6 +89,7 @@ class BundleAdjustment:
         self._columns = self._field + nodes
         free = np.ones(self._columns, bool)
         held = np.arange(frames) == 0 if fixed is None else fixed
+        held = held | (np.bincount(observations.frame, minlength=frames) == 0)  # nothing says where they are
         free[: self._lens] = np.repeat(~held, 6)
         free[self._lens : self._shape] = free_focal
         if lens_sigmas is not None:

@@ -166,10 +166,11 @@ def _frame_results(
             result.inliers = int(inliers[row])
             result.reprojection_error = float(error[row])
             result.prior = prior.get(row)
-            covariance = polished.covariance[row].copy()
-            covariance[3:] *= unit
-            covariance[:, 3:] *= unit
-            result.covariance = covariance
+            if seen[row]:
+                covariance = polished.covariance[row].copy()
+                covariance[3:] *= unit
+                covariance[:, 3:] *= unit
+                result.covariance = covariance
             result.observability = polished.observability[row]
             result.message = f"{result.inliers} of {seen[row]} tracks within {threshold:.2f} pixels"
             if polished.motion.kind is ShotKind.STATIC:
