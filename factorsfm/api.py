@@ -43,6 +43,9 @@ def reconstruct(
 ) -> Reconstruction:
     """Camera path, lens and sparse points of one shot, or of a set of photographs.
 
+    Photographs of several scenes, or of parts of one that cannot be joined, make a reconstruction of each: the largest
+    is returned, the others are its `others`.
+
     Args:
         source: a video file, a folder of images, or any iterable of 8-bit images (BGR or grey) or `Frame`s.
         camera: the lens; None takes EXIF or a guess.
@@ -73,9 +76,10 @@ def reconstruct(
         result = _from_images(source, frames, camera, prior, mask_prior, options, work, progress)
     else:
         result = _from_shot(source, frames, camera, prior, mask_prior, options, progress)
-    result.seconds["total"] = time.perf_counter() - begin
-    result.options["source"] = str(source) if isinstance(source, str | Path) else "frames"
-    result.options["unordered"] = unordered
+    for part in (result, *result.others):
+        part.seconds["total"] = time.perf_counter() - begin
+        part.options["source"] = str(source) if isinstance(source, str | Path) else "frames"
+        part.options["unordered"] = unordered
     return result
 
 

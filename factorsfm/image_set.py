@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import logging
 import time
-import zlib
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
@@ -21,13 +19,14 @@ from factorsfm.errors import InputError, ReconstructionError
 from factorsfm.frames import Frame, bgr_image
 from factorsfm.images import ImageTracks, MappedImage
 from factorsfm.options import Options
+from factorsfm.photos import Photo, PhotoFolder, size_text
 from factorsfm.polish import polish
 from factorsfm.priors.depth import DepthKind, DepthPrior
 from factorsfm.priors.masks import MaskPrior
 from factorsfm.reading import read_depth, read_mask
 from factorsfm.reconstruction import FrameResult, FrameStatus, Reconstruction
 from factorsfm.result import assemble
-from factorsfm.set_mapper import SetMapper
+from factorsfm.set_mapper import SetMapper, map_parts
 from factorsfm.threads import OneThreadEach
 from factorsfm.tracks.matches import join_tracks, match_images
 
@@ -36,32 +35,8 @@ Progress = Callable[[str, int, int | None], None]
 
 logger = logging.getLogger(__name__)
 
-MAX_SIDE = 3200  # pixels; larger images are matched and reconstructed at this size
 _SAME_ASPECT = 0.01
 _LEAST_KEYPOINTS = 30
-
-
-@dataclass(slots=True)
-class Photo:
-    """What is kept of an image: never its pixels.
-
-    Attributes:
-        index, name, timestamp: see `Frame`.
-        file: its copy in the work folder, empty where the image is left out; size: (width, height) of the copy.
-        full_size: (width, height) of the image itself.
-        left_out: why it takes no part, empty where it does; twin: position of an earlier image with the same pixels.
-        remark: what a user should know of it.
-    """
-
-    index: int
-    name: str
-    timestamp: float | None
-    file: str = ""
-    size: tuple[int, int] = (0, 0)
-    full_size: tuple[int, int] = (0, 0)
-    left_out: str = ""
-    twin: int | None = None
-    remark: str = ""
 
 
 class ImageSet:
@@ -98,10 +73,9 @@ class ImageSet:
         self.notes: list[str] = []
         self._depth = depth if options.uses_depth else None
         self._masks = masks
-        self._folder = folder
+        self._database = folder / "matches.db"
+        self._files = PhotoFolder(folder, masked=masks is not None)
         self._focal_ratios: list[float] = []
-        self._known: dict[str, int] = {}
-        (folder / "images").mkdir(parents=True, exist_ok=True)
 
     def add(self, frame: Frame) -> None:
         """Take an image.
@@ -113,29 +87,12 @@ class ImageSet:
         with self._timed("masks"):
             mask = read_mask(self._masks, frame)
         with self._timed("reading"):
-            height, width = image.shape[:2]
-            photo = Photo(frame.index, frame.name, frame.timestamp, full_size=(width, height))
-            image, mask = _bounded(image, mask)
-            if max(width, height) > MAX_SIDE:
-                photo.remark = f"reduced from {width}x{height} to {image.shape[1]}x{image.shape[0]} pixels"
-                logger.warning("%s is %s", frame.name, photo.remark)
-            checksum = zlib.crc32(image.tobytes() + (b"" if mask is None else mask.tobytes()))
-            key = f"{checksum:08x}-{image.shape[1]}x{image.shape[0]}"
-            photo.file, photo.size = f"{frame.index:06d}-{key}.png", (image.shape[1], image.shape[0])
-            photo.twin = self._known.setdefault(key, len(self.photos))
-            if photo.twin == len(self.photos):
-                photo.twin = None
-                _write_once(self._folder / "images" / photo.file, image)
-                if self._masks is not None:
-                    ignored = np.zeros(image.shape[:2], bool) if mask is None else mask
-                    _write_once(
-                        self._folder / "masks" / f"{photo.file}.png", np.where(ignored, 0, 255).astype(np.uint8)
-                    )
+            photo = self._files.keep(frame, image, mask, len(self.photos))
             self.photos.append(photo)
             if self.camera is None and frame.path is not None:
-                guess = guess_camera(width, height, frame.path)
+                guess = guess_camera(*photo.full_size, frame.path)
                 if guess.has_prior_focal_length:
-                    self._focal_ratios.append(guess.focal_length / max(width, height))
+                    self._focal_ratios.append(guess.focal_length / max(photo.full_size))
 
     def note(self, sentence: str) -> None:
         """Take note of something that a user should read in the result."""
@@ -164,43 +121,22 @@ class ImageSet:
         colors = self._look_up(used, tracks, pixels, report)
         report("mapping", 0, None)
         focal = 0.5 * (camera.focal_length_x + camera.focal_length_y)
-        mapper = SetMapper(tracks, focal, self.options)
         with self._timed("mapping"), OneThreadEach():
-            mapper.run()
-        self._explain(mapper.images)
-        registered = sum(image.registered for image in mapper.images)
-        if registered < 2:
-            worst = next(k for k in used if not mapper.images[k].registered)
+            parts = map_parts(tracks, focal, self.options)
+        self._explain(parts)
+        if parts[0].registered < 2:
+            images = parts[0].images
+            worst = next(k for k in used if not images[k].registered)
             raise self._failure(
-                f"{registered} of {len(self.photos)} images registered, at least 2 needed; "
-                f"{self.photos[worst].name}: {mapper.images[worst].message}",
-                mapper.images,
+                f"{parts[0].registered} of {len(self.photos)} images registered, at least 2 needed; "
+                f"{self.photos[worst].name}: {images[worst].message}",
+                images,
             )
-        with self._timed("polish"), OneThreadEach():
-            polished = polish(
-                mapper.images,
-                mapper.points.all(),
-                np.array([mapper.focal]),
-                self.options,
-                lambda stage: report(stage, 0, None),
-                lens_shape(camera) if self.options.refine_focal_length else None,
-            )
-        result = assemble(
-            polished,
-            mapper.images,
-            self.photos,
-            pixels,
-            colors,
-            camera,
-            lens_given=self._lens_given,
-            prior_given=self._depth is not None,
-            metric=self._depth is not None and self._depth.kind is DepthKind.METRIC,
-            seconds=dict(self.seconds),
-            options=self.options.to_dict(),
-        )
-        self._at_full_size(result)
-        self._add_twins(result)
-        result.notes.extend(self._summary(result))
+        result, *others = [self._solve(part, camera, pixels, colors, report) for part in parts]
+        for number, part in enumerate((result, *others), 1):
+            part.notes += self._summary(part, number, parts)
+            part.seconds = dict(self.seconds)
+        result.others = others
         return result
 
     # --- one camera ---------------------------------------------------------------------------------------------
@@ -219,32 +155,21 @@ class ImageSet:
         full = (int(self.camera.width), int(self.camera.height))
         for photo in photos:
             if not _same_format(photo.full_size, full) and not _same_format(photo.full_size[::-1], full):
-                photo.left_out = f"{_text(photo.full_size)} pixels, another format than {_text(full)} of the camera"
+                photo.left_out = (
+                    f"{size_text(photo.full_size)} pixels, another format than {size_text(full)} of the camera"
+                )
                 logger.warning("%s is left out: %s", photo.name, photo.left_out)
             elif not _same_format(photo.full_size, full):
-                self._turn(photo)
+                self._files.turn(photo)
         fitting = [photo for photo in photos if not photo.left_out]
         if not fitting:
             raise InputError(
-                f"the camera is made for {_text(full)} pixels, but none of the {len(photos)} images has this format"
+                f"the camera is made for {size_text(full)} pixels, but none of the {len(photos)} images has this format"
             )
         camera = pycolmap.Camera(self.camera.todict())
         width, height = Counter(photo.size for photo in fitting).most_common(1)[0][0]
         camera.rescale(width, height)
         return camera
-
-    def _turn(self, photo: Photo) -> None:
-        """Turn the working copy by 90 degrees."""
-        folder, turned = self._folder, photo.file.replace(".png", "-turned.png")
-        image = cv2.imread(str(folder / "images" / photo.file))
-        _write_once(folder / "images" / turned, cv2.rotate(image, cv2.ROTATE_90_COUNTERCLOCKWISE))
-        mask = folder / "masks" / f"{photo.file}.png"
-        if mask.exists():
-            sideways = cv2.imread(str(mask), cv2.IMREAD_GRAYSCALE)
-            _write_once(folder / "masks" / f"{turned}.png", cv2.rotate(sideways, cv2.ROTATE_90_COUNTERCLOCKWISE))
-        photo.remark = "turned left by 90 degrees to the format of the others; its pose is that of the turned image"
-        logger.warning("%s is %s", photo.name, photo.remark)
-        photo.file, photo.size, photo.full_size = turned, photo.size[::-1], photo.full_size[::-1]
 
     # --- steps --------------------------------------------------------------------------------------------------
 
@@ -256,9 +181,8 @@ class ImageSet:
             own.rescale(*self.photos[k].size)
             cameras.append(own)
         names = [self.photos[k].file for k in used]
-        masks = self._folder / "masks" if self._masks is not None else None
         with self._timed("matching"):
-            matches = match_images(self._folder / "matches.db", self._folder / "images", names, cameras, masks)
+            matches = match_images(self._database, self._files.images, names, cameras, self._files.masks)
             joined = join_tracks(matches.keypoints, matches.pairs)
         none = np.zeros(0, np.int64), np.zeros((0, 2))
         tracks = [ImageTracks(k, *none) for k in range(len(self.photos))]
@@ -283,7 +207,7 @@ class ImageSet:
         for done, k in enumerate(used):
             progress("depth", done, len(used))
             photo = self.photos[k]
-            image = np.asarray(cv2.imread(str(self._folder / "images" / photo.file)), np.uint8)
+            image = self._files.read(photo)
             scale = np.array(photo.size) / size
             xy = (pixels[k] + PIXEL_CENTER) * scale - PIXEL_CENTER
             x, y = np.clip(np.rint(xy).astype(int), 0, np.array(photo.size) - 1).T
@@ -294,16 +218,58 @@ class ImageSet:
                     tracks[k] = replace(tracks[k], depth=read_depth(self._depth, frame, xy))
         return colors
 
+    def _solve(
+        self,
+        part: SetMapper,
+        camera: pycolmap.Camera,
+        pixels: list[Array],
+        colors: NDArray[np.uint8],
+        progress: Progress,
+    ) -> Reconstruction:
+        """The polished result of a map."""
+        with self._timed("polish"), OneThreadEach():
+            polished = polish(
+                part.images,
+                part.points.all(),
+                np.array([part.focal]),
+                self.options,
+                lambda stage: progress(stage, 0, None),
+                lens_shape(camera) if self.options.refine_focal_length else None,
+            )
+        result = assemble(
+            polished,
+            part.images,
+            self.photos,
+            pixels,
+            colors,
+            pycolmap.Camera(camera.todict()),
+            lens_given=self._lens_given,
+            prior_given=self._depth is not None,
+            metric=self._depth is not None and self._depth.kind is DepthKind.METRIC,
+            seconds={},
+            options=self.options.to_dict(),
+        )
+        self._at_full_size(result)
+        self._add_twins(result)
+        return result
+
     # --- the report ---------------------------------------------------------------------------------------------
 
-    def _explain(self, images: list[MappedImage]) -> None:
-        for photo, image in zip(self.photos, images, strict=True):
-            if photo.left_out:
-                image.status, image.message = FrameStatus.UNUSABLE, photo.left_out
-            elif photo.remark and not image.registered:
-                blank = "keypoints" in photo.remark
-                image.status = FrameStatus.BLANK if blank else image.status
-                image.message = photo.remark if blank else f"{image.message}; {photo.remark}"
+    def _explain(self, parts: list[SetMapper]) -> None:
+        """Say of every image that is not in a part why, and where it is instead."""
+        home = {i.tracks.position: p for p, part in enumerate(parts) for i in part.images if i.registered}
+        for p, part in enumerate(parts):
+            for k, (photo, image) in enumerate(zip(self.photos, part.images, strict=True)):
+                if photo.left_out:
+                    image.status, image.message = FrameStatus.UNUSABLE, photo.left_out
+                elif k in home and home[k] != p:
+                    reason = "" if image.status is FrameStatus.REGISTERED else f"{image.message}; "
+                    image.status = FrameStatus.LOST
+                    image.message = f"{reason}it is in part {home[k] + 1}, of {parts[home[k]].registered} images"
+                elif photo.remark and not image.registered:
+                    blank = "keypoints" in photo.remark
+                    image.status = FrameStatus.BLANK if blank else image.status
+                    image.message = photo.remark if blank else f"{image.message}; {photo.remark}"
 
     def _add_twins(self, result: Reconstruction) -> None:
         """An image with the pixels of another one has its pose."""
@@ -312,7 +278,8 @@ class ImageSet:
                 twin = result.frames[photo.twin]
                 frame.status, frame.cam_from_world = twin.status, twin.cam_from_world
                 frame.covariance, frame.observability = twin.covariance, twin.observability
-                frame.message = f"the same image as {twin.name}, whose pose it has"
+                fate = "whose pose it has" if twin.registered else twin.message
+                frame.message = f"the same image as {twin.name}, {fate}"
             elif photo.remark and frame.registered:
                 frame.message += f"; {photo.remark}"
 
@@ -330,10 +297,21 @@ class ImageSet:
                     slide = frame.observability.pixel_slide * factor
                     frame.observability = replace(frame.observability, pixel_slide=slide)
 
-    def _summary(self, result: Reconstruction) -> list[str]:
+    def _summary(self, result: Reconstruction, number: int, parts: list[SetMapper]) -> list[str]:
         notes = [f"{photo.name}: {photo.left_out}." for photo in self.photos if photo.left_out]
         notes += [f"{photo.name}: {photo.remark}." for photo in self.photos if photo.remark]
-        missing = [f for f, p in zip(result.frames, self.photos, strict=True) if not f.registered and not p.left_out]
+        if len(parts) > 1:
+            sizes = ", ".join(str(part.registered) for part in parts)
+            notes.append(
+                f"The images fall into {len(parts)} parts that could not be joined, of {sizes} images; this is "
+                f"part {number}, and each has a scale and a world of its own."
+            )
+        found = {i.tracks.position for part in parts for i in part.images if i.registered}
+        missing = [
+            frame
+            for k, (frame, photo) in enumerate(zip(result.frames, self.photos, strict=True))
+            if not photo.left_out and k not in found and photo.twin not in found
+        ]
         if missing:
             some = "; ".join(f"{frame.name}: {frame.message}" for frame in missing[:3])
             notes.append(f"{len(missing)} of {len(result.frames)} images could not be registered ({some}).")
@@ -370,34 +348,5 @@ def _for_image_sets(options: Options) -> Options:
     )
 
 
-def _bounded(
-    image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
-) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
-    height, width = image.shape[:2]
-    factor = MAX_SIDE / max(width, height)
-    if factor >= 1.0:
-        return image, mask
-    size = (max(1, round(width * factor)), max(1, round(height * factor)))
-    reduced = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-    if mask is None:
-        return reduced, None
-    return reduced, cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-
-
-def _write_once(path: Path, image: NDArray[np.uint8]) -> None:
-    """Write a file that is complete or absent."""
-    if path.exists():
-        return
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_suffix(".unfinished.png")
-    if not cv2.imwrite(str(unfinished), image, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
-        raise InputError(f"cannot write to the work folder {path.parent}")
-    unfinished.replace(path)
-
-
 def _same_format(size: tuple[int, int], other: tuple[int, int]) -> bool:
     return abs(size[0] * other[1] / (size[1] * other[0]) - 1.0) < _SAME_ASPECT
-
-
-def _text(size: tuple[int, int]) -> str:
-    return f"{size[0]}x{size[1]}"

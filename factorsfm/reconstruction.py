@@ -164,6 +164,7 @@ class Reconstruction:
         notes: sentences that a user should read (translation unobservable, focal length guessed, ...).
         seconds: wall time by stage.
         options: resolved options as plain data.
+        others: of an image set, the parts of the scene that cannot be joined to this one, largest first.
     """
 
     camera: pycolmap.Camera
@@ -184,6 +185,7 @@ class Reconstruction:
     notes: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
     options: dict[str, Any] = field(default_factory=dict)
+    others: list[Reconstruction] = field(default_factory=list)
 
     @property
     def registered(self) -> list[FrameResult]:
@@ -198,6 +200,8 @@ class Reconstruction:
 
     def write(self, directory: str | Path) -> None:
         """Write trajectory, COLMAP model, point cloud, summary and report; all of it or nothing.
+
+        Other parts of an image set are written in the same way into `part-002`, `part-003`, ... in it.
 
         Raises:
             InputError: the directory cannot be written.

@@ -27,6 +27,7 @@ Index = NDArray[np.int64]
 
 logger = logging.getLogger(__name__)
 
+_SMALLEST_PART = 3  # images, besides those of the first part
 _MOST_COMMON_PAIRS = 300  # whose parallax is measured
 _STARTS_TRIED = 4
 _WIDE_ENOUGH_DEG = 8.0  # median angle of the rays beyond which a pair is no better for a start
@@ -39,6 +40,36 @@ _PYRAMID = (2, 4, 8, 16, 32)  # cells across, of the score by which the next ima
 _SIGMA_PX = 0.5  # of keypoints, until it is measured
 _GOOD_PX = 4.0  # reprojection error of a good observation
 _FOCAL_IMAGES, _FOCAL_ANGLE_DEG = 4, 3.0  # from which a guessed focal length is refined with the map
+
+
+def map_parts(tracks: list[ImageTracks], focal: float, options: Options) -> list[SetMapper]:
+    """A map of the images that belong together, and others among those that are left over.
+
+    What cannot be joined to a map, for want of common tracks or because no pose agrees with it, gets a map of its own
+    where at least three images make one.
+
+    Returns:
+        The maps by number of images, largest first. An image is registered in one of them at most; where it is not,
+        its message says why it is not in the first map that was made. That one is there even without images.
+    """
+    parts: list[SetMapper] = []
+    nothing = np.zeros(0, np.int64), np.zeros((0, 2))
+    while True:
+        mapper = SetMapper(tracks, focal, options)
+        mapper.run()
+        tried = [image for image in mapper.images if image.status is not FrameStatus.TOO_FEW_TRACKS]
+        found = [image for image in mapper.images if image.registered]
+        if not parts or len(found) >= _SMALLEST_PART:
+            parts.append(mapper)
+        done = {image.tracks.position for image in (found if len(found) >= _SMALLEST_PART else tried)}
+        if not done:
+            break
+        tracks = [ImageTracks(t.position, *nothing) if t.position in done else t for t in tracks]
+    for part in parts[1:]:  # there, images were missing
+        for image, first in zip(part.images, parts[0].images, strict=True):
+            if not image.registered:
+                image.status, image.message = first.status, first.message
+    return sorted(parts, key=lambda part: -part.registered)
 
 
 class SetMapper:
@@ -66,6 +97,11 @@ class SetMapper:
         self._order: list[MappedImage] = []  # of registration; the first one is the world
         self._adjusted = 0
         self._angle = 0.0  # median angle between the rays of the latest points, degrees
+
+    @property
+    def registered(self) -> int:
+        """Number of images with a pose."""
+        return sum(image.registered for image in self.images)
 
     # --- the algorithm ------------------------------------------------------------------------------------------
 

@@ -49,6 +49,7 @@ def summary(reconstruction: Reconstruction) -> dict[str, Any]:
         "lens": reconstruction.lens and asdict(reconstruction.lens),
         "seconds": with_total(reconstruction.seconds),
         "notes": reconstruction.notes,
+        "parts": 1 + len(reconstruction.others),
         "statuses": [_frame_json(frame) for frame in reconstruction.frames],
         "options": reconstruction.options,
     }
@@ -84,6 +85,11 @@ def verdict(reconstruction: Reconstruction) -> str:
     return f"{sentence}; {motion}, no parallax"
 
 
+def part_name(number: int) -> str:
+    """Folder, in that of the first part, of the result of another part of an image set; counted from 1."""
+    return f"part-{number:03d}"
+
+
 def registered_share(reconstruction: Reconstruction) -> str:
     """All frames, or so many of them."""
     frames, registered = len(reconstruction.frames), len(reconstruction.registered)
@@ -93,7 +99,10 @@ def registered_share(reconstruction: Reconstruction) -> str:
 def conclusion(reconstruction: Reconstruction, output: Path) -> str:
     """What to say of a result that has been written."""
     notes = [f"Note: {note}" for note in reconstruction.notes]
-    return "\n".join([f"{verdict(reconstruction)}.", *notes, f"Result in {output}; open {output / 'report.html'}"])
+    parts = [f"{part_name(n)}: {verdict(other)}." for n, other in enumerate(reconstruction.others, 2)]
+    return "\n".join(
+        [f"{verdict(reconstruction)}.", *notes, *parts, f"Result in {output}; open {output / 'report.html'}"]
+    )
 
 
 def median_reprojection_error(reconstruction: Reconstruction) -> float:

@@ -1,5 +1,6 @@
 """Unordered images: the mapper on exact projections with wrong matches, and whole folders of rendered images."""
 
+import json
 import logging
 import struct
 from dataclasses import replace
@@ -7,16 +8,19 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 
-from factorsfm import Frame, FrameStatus, InputError, Options, ReconstructionError, reconstruct
+from factorsfm import Frame, FrameStatus, InputError, Options, ReconstructionError, cli, read_result, reconstruct
+from factorsfm.camera import camera_to_json
 from factorsfm.evaluation.alignment import pose_arrays
-from factorsfm.evaluation.metrics import TrajectoryErrors, trajectory_errors
+from factorsfm.evaluation.metrics import TrajectoryErrors, auc, relative_pose_errors, trajectory_errors
+from factorsfm.evaluation.readers import read_shot
 from factorsfm.image_set import ImageSet, _for_image_sets
 from factorsfm.images import ImageTracks
 from factorsfm.polish import Polished, polish
 from factorsfm.registration import ImageDepth
-from factorsfm.set_mapper import SetMapper
+from factorsfm.set_mapper import SetMapper, map_parts
 from factorsfm.synthetic import RenderedShot, render_shot
 from factorsfm.unordered import Unusable, looks_unordered, other_files, read_images
 
@@ -103,6 +107,46 @@ def test_the_part_with_most_images_is_kept_and_the_others_are_told_why() -> None
     assert mapper.images[11].message.startswith("0 of 15 needed tracks in common with any other image")
 
 
+def registered(mapper: SetMapper) -> list[int]:
+    return [k for k, image in enumerate(mapper.images) if image.registered]
+
+
+def test_parts_without_common_tracks_are_maps_of_their_own() -> None:
+    rings = (
+        Ring(4, 900, seed=1, first_id=5000),
+        Ring(7, 900),
+        Ring(2, 900, seed=2, first_id=9000),
+        Ring(3, 900, seed=3, first_id=12000),
+    )
+    tracks: list[ImageTracks] = []
+    for ring in rings:
+        tracks += ring.tracks(first=len(tracks))
+    parts = map_parts(tracks, FOCAL, Options())
+    assert [registered(part) for part in parts] == [list(range(4, 11)), [0, 1, 2, 3], [13, 14, 15]]
+    for part, ring, first in zip(parts, (rings[1], rings[0], rings[3]), (4, 0, 13), strict=True):
+        poses = [image.pose for image in part.images[first : first + len(ring.rotation)]]
+        errors = ring.errors(np.array([r for r, _ in poses]), np.array([t for _, t in poses]))
+        assert errors.ate.max() < 0.02
+        assert "a part of 2 images" in part.images[11].message  # too small for one of its own
+
+
+def test_what_no_pose_joins_to_the_map_is_started_anew() -> None:
+    """Four images have enough tracks in common with the others, but the matches that join them are wrong."""
+    large, small = Ring(7), Ring(4, points=800, seed=1, first_id=5000)
+    generator = np.random.default_rng(4)
+    tracks = large.tracks()
+    for t in small.tracks(first=7):
+        ids = np.sort(generator.choice(large.ids, 60, replace=False))
+        xy = generator.uniform(-0.4, 0.4, (60, 2))
+        tracks.append(ImageTracks(t.position, np.concatenate([ids, t.ids]), np.concatenate([xy, t.xy])))
+    first, second = map_parts(tracks, FOCAL, Options())
+    assert registered(first) == list(range(7))
+    assert registered(second) == [7, 8, 9, 10]
+    assert "of 15 needed inliers" in first.images[7].message
+    poses = [image.pose for image in second.images[7:]]
+    assert small.errors(np.array([r for r, _ in poses]), np.array([t for _, t in poses])).ate.max() < 0.02
+
+
 def test_an_image_of_wrong_matches_is_not_registered() -> None:
     ring = Ring(6)
     tracks = ring.tracks()
@@ -176,7 +220,7 @@ def jpeg_with_orientation(image: np.ndarray, orientation: int) -> bytes:
 def test_odd_files_are_told_and_do_not_stop_the_rest(
     shot: RenderedShot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("factorsfm.image_set.MAX_SIDE", 600)
+    monkeypatch.setattr("factorsfm.photos.MAX_SIDE", 600)
     names = ["beach", "cat", "door", "house", "tree"]
     for name, image in zip(names, shot.images, strict=True):
         cv2.imwrite(str(tmp_path / f"{name}.png"), image)
@@ -228,6 +272,42 @@ def test_odd_files_are_told_and_do_not_stop_the_rest(
     assert (tmp_path / "out" / "trajectory.tum").read_text().count("\n") >= len(posed)
 
 
+def test_two_scenes_make_two_results(shot: RenderedShot, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The mirrored images are another scene: their keypoints match none of the first."""
+    (tmp_path / "images").mkdir()
+    for k, image in enumerate(shot.images):
+        cv2.imwrite(str(tmp_path / "images" / f"a{k}.png"), image)
+    for k in range(3):
+        cv2.imwrite(str(tmp_path / "images" / f"b{k}.png"), cv2.flip(shot.images[k], 1))
+    cv2.imwrite(str(tmp_path / "images" / "twin.png"), cv2.flip(shot.images[1], 1))
+    (tmp_path / "camera.json").write_text(json.dumps(camera_to_json(shot.camera)))
+    command = ["reconstruct", str(tmp_path / "images"), "--output", str(tmp_path / "out"), "--depth", "none"]
+    assert cli.main([*command, "--camera", str(tmp_path / "camera.json"), "--unordered"]) == 0
+
+    said = capsys.readouterr().out
+    assert "fall into 2 parts that could not be joined, of 5, 3 images; this is part 1" in said
+    assert "part-002: 4 of 9 frames registered" in said
+    first = read_result(tmp_path / "out")
+    (second,) = first.others
+    assert [frame.name for frame in first.registered] == [f"a{k}.png" for k in range(5)]
+    assert [frame.name for frame in second.registered] == ["b0.png", "b1.png", "b2.png", "twin.png"]
+    assert len(first.points) > len(second.points) > 100
+    frames = {frame.name: frame for frame in first.frames}
+    assert frames["b0.png"].status is FrameStatus.LOST
+    assert frames["b0.png"].message.endswith("it is in part 2, of 3 images")
+    assert frames["twin.png"].message.startswith("the same image as b1.png, ")
+    assert second.frames[0].message == "it is in part 1, of 5 images"
+    assert not any("could not be registered" in note for note in first.notes + second.notes)
+    expected = pose_arrays(shot.cam_from_world[:3])
+    centers = pose_arrays([frame.cam_from_world for frame in second.registered[:3]])[1]
+    sides, true = (np.linalg.norm(c - np.roll(c, 1, 0), axis=1) for c in (centers, expected[1]))
+    np.testing.assert_allclose(sides / sides.sum(), true / true.sum(), atol=0.02)  # a triangle has no handedness
+
+    second.write(tmp_path / "out")  # a result of one part leaves nothing of the other
+    assert not (tmp_path / "out" / "part-002").exists()
+    assert read_result(tmp_path / "out").others == []
+
+
 def test_a_given_camera_of_another_format_is_refused(shot: RenderedShot, tmp_path: Path) -> None:
     images = ImageSet(tmp_path, shot.camera)
     for k in range(2):
@@ -275,11 +355,25 @@ def test_sets_and_shots_are_told_apart(shot: RenderedShot, tmp_path: Path) -> No
 
 
 @pytest.mark.slow
+def test_two_real_scenes_in_one_folder(shared_data: Path, tmp_path: Path) -> None:
+    """The photographs of both were taken with one lens."""
+    shots = [read_shot(shared_data / "real" / name) for name in ("fountain-P11", "herzjesu-P8")]
+    for name in ("fountain-P11", "herzjesu-P8"):
+        for path in sorted((shared_data / "real" / name / "images").iterdir()):
+            image = cv2.imread(str(path), cv2.IMREAD_REDUCED_COLOR_2)
+            cv2.imwrite(str(tmp_path / f"{name}-{path.stem}.png"), image)
+    camera = pycolmap.Camera(shots[0].camera.todict())
+    camera.rescale(image.shape[1], image.shape[0])
+    result = reconstruct(tmp_path, camera=camera, depth=None)
+    for part, shot, size in zip((result, *result.others), shots, (11, 8), strict=True):
+        assert len(part.registered) == size
+        estimate = pose_arrays([frame.cam_from_world for frame in part.registered])
+        assert auc(relative_pose_errors(*estimate, shot.rotations, shot.centers), 1.0) > 75.0
+
+
+@pytest.mark.slow
 def test_strecha_photographs_as_well_as_colmap(shared_data: Path) -> None:
     """COLMAP's incremental mapper reaches 93.6 % and 3.9 mm here (same images, same lens)."""
-    from factorsfm.evaluation.metrics import auc, relative_pose_errors
-    from factorsfm.evaluation.readers import read_shot
-
     folder = shared_data / "real" / "herzjesu-P8"
     shot = read_shot(folder)
     result = reconstruct(folder / "images", camera=shot.camera, depth=None, unordered=True)

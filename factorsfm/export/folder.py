@@ -16,7 +16,7 @@ from factorsfm.export.ply import write_ply
 from factorsfm.export.trajectory import write_trajectory
 from factorsfm.reconstruction import FrameResult, Reconstruction
 from factorsfm.report.page import failure_html, report_html
-from factorsfm.summary import PROGRAM, failure_summary, json_text, summary
+from factorsfm.summary import PROGRAM, failure_summary, json_text, part_name, summary
 
 # Whatever an earlier result may have left; picture.png is drawn by the demo.
 _ENTRIES = ("trajectory.tum", "colmap", "points.ply", "report.html", "picture.png", "summary.json")
@@ -25,17 +25,25 @@ _ENTRIES = ("trajectory.tum", "colmap", "points.ply", "report.html", "picture.pn
 def write_folder(reconstruction: Reconstruction, directory: str | Path) -> None:
     """Write trajectory.tum, colmap/, points.ply, summary.json and report.html; all of them or nothing.
 
-    The files of an earlier result are replaced; other files in such a folder stay.
+    Other parts of an image set become folders in it, part-002 and so on. The files of an earlier result are replaced;
+    other files in such a folder stay.
 
     Raises:
         InputError: the directory cannot be written, or holds something else than an earlier result.
     """
     with _complete_or_nothing(Path(directory)) as folder:
-        write_trajectory(reconstruction, folder / "trajectory.tum")
-        write_colmap(reconstruction, folder / "colmap")
-        write_ply(reconstruction, folder / "points.ply")
-        (folder / "report.html").write_text(report_html(reconstruction), encoding="utf-8")
-        (folder / "summary.json").write_text(json_text(summary(reconstruction)), encoding="utf-8")
+        _write_files(reconstruction, folder)
+        for number, other in enumerate(reconstruction.others, 2):
+            (folder / part_name(number)).mkdir()
+            _write_files(other, folder / part_name(number))
+
+
+def _write_files(reconstruction: Reconstruction, folder: Path) -> None:
+    write_trajectory(reconstruction, folder / "trajectory.tum")
+    write_colmap(reconstruction, folder / "colmap")
+    write_ply(reconstruction, folder / "points.ply")
+    (folder / "report.html").write_text(report_html(reconstruction), encoding="utf-8")
+    (folder / "summary.json").write_text(json_text(summary(reconstruction)), encoding="utf-8")
 
 
 def write_failure(
@@ -100,7 +108,8 @@ def _complete_or_nothing(directory: Path) -> Iterator[Path]:
 
 def _replace_entries(new: Path, directory: Path) -> None:
     """Swap the files one by one; summary.json, which marks a result, goes last."""
-    for name in _ENTRIES:
+    parts = {path.name for folder in (directory, new) for path in folder.glob("part-*") if is_earlier_result(path)}
+    for name in (*sorted(parts), *_ENTRIES):
         old = directory / name
         if old.is_dir():
             shutil.rmtree(old)

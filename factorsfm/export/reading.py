@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from factorsfm.camera import PIXEL_CENTER
 from factorsfm.errors import InputError
 from factorsfm.reconstruction import FrameResult, FrameStatus, PriorFit, Reconstruction, ShotKind
-from factorsfm.summary import PROGRAM
+from factorsfm.summary import PROGRAM, part_name
 
 
 def read_result(directory: str | Path) -> Reconstruction:
@@ -31,9 +31,11 @@ def read_result(directory: str | Path) -> Reconstruction:
     content = _summary(directory)
     try:
         model = pycolmap.Reconstruction(directory / "colmap")
-        return _reconstruction(content, model)
+        result = _reconstruction(content, model)
     except (OSError, ValueError, KeyError, TypeError, IndexError, RuntimeError) as error:
         raise InputError(f"the result in {directory} is damaged: {error}") from error
+    result.others = [read_result(directory / part_name(number)) for number in range(2, content.get("parts", 1) + 1)]
+    return result
 
 
 def _summary(directory: Path) -> dict[str, Any]:
