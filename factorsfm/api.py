@@ -38,6 +38,7 @@ def reconstruct(
     preset: str = "default",
     lens: LensFreedom = "auto",
     unordered: bool | None = None,
+    features: str | Path = "sift",
     work: str | Path | None = None,
     progress: Progress | None = None,
 ) -> Reconstruction:
@@ -57,6 +58,8 @@ def reconstruct(
         lens: what of the lens is estimated where the shot determines it, see `Options`.
         unordered: whether the images are a set in any order, which are matched with each other, or a shot, which is
             tracked from frame to frame; None decides for folders by `unordered.looks_unordered`.
+        features: of a set: "sift"; "xfeat", whose networks lie in the folder that ``FACTORSFM_MODELS`` names; or a
+            folder that holds them.
         work: folder for the features and matches of a set, from which an interrupted run goes on; None keeps nothing.
         progress: called with the stage, the frames done, and their number where it is known.
 
@@ -73,13 +76,14 @@ def reconstruct(
     if unordered is None:
         unordered = isinstance(source, str | Path) and looks_unordered(Path(source), frames)
     if unordered:
-        result = _from_images(source, frames, camera, prior, mask_prior, options, work, progress)
+        result = _from_images(source, frames, camera, prior, mask_prior, options, features, work, progress)
     else:
         result = _from_shot(source, frames, camera, prior, mask_prior, options, progress)
     for part in (result, *result.others):
         part.seconds["total"] = time.perf_counter() - begin
         part.options["source"] = str(source) if isinstance(source, str | Path) else "frames"
         part.options["unordered"] = unordered
+        part.options["features"] = str(features)
     return result
 
 
@@ -110,11 +114,12 @@ def _from_images(
     depth: DepthPrior | None,
     masks: MaskPrior | None,
     options: Options,
+    features: str | Path,
     work: str | Path | None,
     progress: Progress | None,
 ) -> Reconstruction:
     with _work_folder(work) as folder:
-        images = ImageSet(folder, camera, depth=depth, masks=masks, options=options)
+        images = ImageSet(folder, camera, depth=depth, masks=masks, features=features, options=options)
         if isinstance(source, str | Path) and (others := other_files(Path(source))):
             images.note(f"{len(others)} files that are no images were ignored: {', '.join(others[:5])}.")
         for done, image in enumerate(read_images(source, frames)):

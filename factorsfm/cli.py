@@ -85,6 +85,7 @@ def _reconstruct(arguments: argparse.Namespace, progress: _Progress) -> str:
             preset=arguments.preset,
             lens=arguments.lens,
             unordered=arguments.unordered or None,
+            features=arguments.features,
             work=arguments.work,
             progress=progress,
         )
@@ -195,6 +196,13 @@ def _parser() -> argparse.ArgumentParser:
         "--unordered",
         action="store_true",
         help="match the images of a folder with each other, in any order; by itself where they are hardly a shot",
+    )
+    reconstruct.add_argument(
+        "--features",
+        default="sift",
+        metavar="sift|xfeat|FOLDER",
+        help="keypoints of an unordered set; for xfeat the folder of its networks is named here or in FACTORSFM_MODELS "
+        "(default: %(default)s)",
     )
     reconstruct.add_argument(
         "--work",

@@ -28,6 +28,7 @@ from factorsfm.reconstruction import FrameResult, FrameStatus, Reconstruction
 from factorsfm.result import assemble
 from factorsfm.set_mapper import SetMapper, map_parts
 from factorsfm.threads import OneThreadEach
+from factorsfm.tracks.learned import LearnedFeatures
 from factorsfm.tracks.matches import join_tracks, match_images
 
 Array = NDArray[np.float64]
@@ -50,7 +51,11 @@ class ImageSet:
         camera: the lens; None takes the focal length from the EXIF data or a guess, and refines it.
         depth: prior, or None.
         masks: what to ignore, or None.
+        features: "sift"; the name of learned ones, see `tracks.learned.FEATURES`; or a folder with their networks.
         options: see `Options`; None is the default preset.
+
+    Raises:
+        ModelError: the networks of the features are not there.
     """
 
     def __init__(
@@ -60,6 +65,7 @@ class ImageSet:
         *,
         depth: DepthPrior | None = None,
         masks: MaskPrior | None = None,
+        features: str | Path = "sift",
         options: Options | None = None,
     ) -> None:
         self.camera = camera
@@ -73,7 +79,8 @@ class ImageSet:
         self.notes: list[str] = []
         self._depth = depth if options.uses_depth else None
         self._masks = masks
-        self._database = folder / "matches.db"
+        self._features = None if str(features) == "sift" else LearnedFeatures(features)
+        self._database = folder / ("matches.db" if self._features is None else f"matches-{self._features.name}.db")
         self._files = PhotoFolder(folder, masked=masks is not None)
         self._focal_ratios: list[float] = []
 
@@ -182,7 +189,9 @@ class ImageSet:
             cameras.append(own)
         names = [self.photos[k].file for k in used]
         with self._timed("matching"):
-            matches = match_images(self._database, self._files.images, names, cameras, self._files.masks)
+            matches = match_images(
+                self._database, self._files.images, names, cameras, self._files.masks, self._features
+            )
             joined = join_tracks(matches.keypoints, matches.pairs)
         none = np.zeros(0, np.int64), np.zeros((0, 2))
         tracks = [ImageTracks(k, *none) for k in range(len(self.photos))]

@@ -54,6 +54,20 @@ def cache_folder() -> Path:
     return Path(pooch.os_cache("factorsfm")) / "models"
 
 
+def model_folders() -> list[Path]:
+    """Where networks are looked for: the folder ``FACTORSFM_MODELS`` and the user's cache.
+
+    Raises:
+        ModelError: the variable names no folder.
+    """
+    variable = os.environ.get(MODELS_VARIABLE)
+    if not variable:
+        return [cache_folder()]
+    if not Path(variable).is_dir():
+        raise ModelError(f"{MODELS_VARIABLE} must name a folder of networks, not {variable}")
+    return [Path(variable), cache_folder()]
+
+
 def find_model(path_or_name: str | Path) -> Path:
     """The file of a network given by its path or its name (a key of `MODELS`).
 
@@ -70,14 +84,8 @@ def find_model(path_or_name: str | Path) -> Path:
 
 
 def _find_named(name: str) -> Path:
-    model = MODELS[name]
-    folders = [cache_folder()]
-    if variable := os.environ.get(MODELS_VARIABLE):
-        if not Path(variable).is_dir():
-            raise ModelError(f"{MODELS_VARIABLE} must name a folder of networks, not {variable}")
-        folders.insert(0, Path(variable))
-    for folder in folders:
-        path = folder / model.file
+    for folder in model_folders():
+        path = folder / MODELS[name].file
         if path.is_file():
             return _verified(path, name)
     return _fetch(name)

@@ -117,7 +117,7 @@ class Network:
 
     def __init__(self, path: str | Path, spec: NetworkSpec | None = None) -> None:
         self.path = Path(path)
-        self._session = _open_session(self.path)
+        self._session = open_session(self.path)
         self._input, shape = _image_input(self._session, self.path)
         self._dtype = _INPUT_TYPES[self._input.type]
         self.spec = _guessed_spec(self.path, shape) if spec is None else _checked_spec(spec, self.path, shape)
@@ -161,7 +161,12 @@ class Network:
         return np.ascontiguousarray(values[np.newaxis], dtype=self._dtype)
 
 
-def _open_session(path: Path) -> Any:
+def open_session(path: Path) -> Any:
+    """An onnxruntime session on the CPU.
+
+    Raises:
+        ModelError: the file is missing or no ONNX network.
+    """
     if not path.is_file():
         raise ModelError(f"there is no network file {path}")
     options = onnxruntime.SessionOptions()

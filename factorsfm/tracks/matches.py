@@ -1,4 +1,4 @@
-"""Correspondences of image sets, through pycolmap: SIFT features, pairs, verified matches, and the tracks they form.
+"""Correspondences of image sets, through pycolmap: features, pairs, verified matches, and the tracks they form.
 
 The database lies in a work folder. Images that have features and pairs that are verified are not touched again, so an
 interrupted run goes on where it stopped.
@@ -17,6 +17,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from factorsfm.camera import PIXEL_CENTER
+from factorsfm.tracks.learned import LearnedFeatures, find_all, likeness, match_pairs
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -59,7 +60,12 @@ class SetMatches:
 
 
 def match_images(
-    database: Path, images: Path, names: Sequence[str], cameras: Sequence[pycolmap.Camera], masks: Path | None = None
+    database: Path,
+    images: Path,
+    names: Sequence[str],
+    cameras: Sequence[pycolmap.Camera],
+    masks: Path | None = None,
+    features: LearnedFeatures | None = None,
 ) -> SetMatches:
     """Features of all images, matches of all pairs worth a try, verified by epipolar geometry.
 
@@ -68,12 +74,16 @@ def match_images(
         images: folder of the image files; names: the files, in order.
         cameras: of each image; `has_prior_focal_length` decides whether the lens takes part in the verification.
         masks: folder with a file "NAME.png" for every image, zero = ignore.
+        features: None is SIFT. A database holds one kind of them.
     """
     pycolmap.set_random_seed(_SEED)
     if database.exists() and not _stored_names(database) <= set(names):
         logger.info("the matches in %s are of other images and are made anew", database)
         database.unlink()
     with _quiet_colmap():
+        if features is not None:
+            _match_learned(database, images, names, cameras, masks, features)
+            return read_matches(database, names)
         _extract(database, images, names, cameras, masks)
         if len(names) <= EXHAUSTIVE_UP_TO:
             pycolmap.match_exhaustive(database, verification_options=_verification())
@@ -161,6 +171,10 @@ def _extract(
         reader_options=reader,
         extraction_options=options,
     )
+    _set_cameras(database, names, cameras)
+
+
+def _set_cameras(database: Path, names: Sequence[str], cameras: Sequence[pycolmap.Camera]) -> None:
     with pycolmap.Database.open(database) as db:
         for name, camera in zip(names, cameras, strict=True):
             if (image := db.read_image_with_name(name)) is not None:
@@ -199,6 +213,31 @@ def _match_alike(database: Path, count: int) -> None:
     neighbours.overlap = _NEIGHBOURS_BY_NAME
     neighbours.quadratic_overlap = False
     pycolmap.match_sequential(database, pairing_options=neighbours, verification_options=_verification())
+
+
+def _match_learned(
+    database: Path,
+    images: Path,
+    names: Sequence[str],
+    cameras: Sequence[pycolmap.Camera],
+    masks: Path | None,
+    features: LearnedFeatures,
+) -> None:
+    """The same with keypoints and matches by networks; what looks alike, the keypoints themselves say."""
+    with pycolmap.Database.open(database) as db:  # makes it
+        new = [name for name in names if db.read_image_with_name(name) is None]
+    if new:
+        pycolmap.import_images(database, images, camera_mode=pycolmap.CameraMode.PER_IMAGE, image_names=new)
+    _set_cameras(database, names, cameras)
+    keypoints = find_all(database, images, names, features, masks)
+    near = np.abs(np.subtract.outer(np.arange(len(names)), np.arange(len(names))))
+    chosen = near > 0
+    if len(names) > EXHAUSTIVE_UP_TO:
+        rank = np.argsort(np.argsort(-likeness(keypoints), axis=1, kind="stable"), axis=1)
+        chosen &= (near <= _NEIGHBOURS_BY_NAME) | (rank < _NEIGHBOURS_ALIKE)
+    first, second = np.nonzero(np.triu(chosen | chosen.T))
+    pairs = list(zip(first.tolist(), second.tolist(), strict=True))
+    match_pairs(database, names, keypoints, pairs, features, _verification())
 
 
 def _build_vocabulary(database: Path, path: Path) -> None:
