@@ -6,6 +6,7 @@ Every camera path starts at the identity, so the world frame is that of the firs
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
@@ -105,7 +106,7 @@ def synthetic_scene(
     Raises:
         InputError: an unknown motion, fewer than 2 frames, or a parallax outside 0 to 1.
     """
-    camera = _pinhole(640, 360)
+    camera = room_camera(640, 360)
     generator = np.random.default_rng(seed)
     z = 1 / generator.uniform(1 / 8, 1 / 2, points)
     margin = 1.15  # beyond the border of the first image
@@ -115,7 +116,8 @@ def synthetic_scene(
     return SyntheticScene(np.column_stack([xy, z]), camera, path)
 
 
-def _pinhole(width: int, height: int) -> pycolmap.Camera:
+def room_camera(width: int, height: int) -> pycolmap.Camera:
+    """The lens of all synthetic shots, at this size in pixels."""
     focal_length = width / 2 / np.tan(_FIELD_OF_VIEW / 2)
     return pycolmap.Camera(
         camera_id=1,
@@ -202,7 +204,7 @@ def render_shot(
     Raises:
         InputError: an unknown motion, fewer than 2 frames, or a parallax outside 0 to 1.
     """
-    camera = _pinhole(width, height)
+    camera = room_camera(width, height)
     quads = _room(np.random.default_rng(seed))
     depth = float(np.median(1 / _cast(quads, camera, pycolmap.Rigid3d(), 1).inverse_depth))
     path = _camera_path(motion, frames, parallax, depth, seed)
@@ -213,6 +215,22 @@ def render_shot(
         camera=camera,
         cam_from_world=path,
     )
+
+
+def render_views(
+    cam_from_world: Iterable[pycolmap.Rigid3d], width: int, height: int, seed: int = 0
+) -> Iterator[NDArray[np.uint8]]:
+    """The room of `render_shot` from any cameras in it, as (h, w, 3) BGR, one after the other.
+
+    Args:
+        cam_from_world: the cameras; the room has no wall behind that of the identity.
+        width, height, seed: see `render_shot`, whose lens it is.
+    """
+    camera = room_camera(width, height)
+    quads = _room(np.random.default_rng(seed))
+    textures = [_texture(np.random.default_rng([seed, i]), quad, camera.focal_length_x) for i, quad in enumerate(quads)]
+    for pose in cam_from_world:
+        yield _render(quads, textures, camera, pose)
 
 
 def simulate_prior(shot: RenderedShot, error: float = 0.05, seed: int = 0) -> list[NDArray[np.float32]]:

@@ -1,0 +1,274 @@
+"""Image sets: photographs with truth beside COLMAP, learned features, and a large rendered set.
+
+    python -m benchmarks.sets --data FOLDER --models FOLDER [--images 200] [--work FOLDER]
+
+FOLDER/real holds the photographs with their truth (`benchmarks.inputs`). Every measurement runs in a process of its own
+and is kept in sets.json beside the table, so that an interrupted run goes on where it stopped.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import resource
+import tempfile
+import time
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import cv2
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+import factorsfm
+from factorsfm.evaluation.alignment import pose_arrays
+from factorsfm.evaluation.baselines import colmap_default, match_frames
+from factorsfm.evaluation.metrics import auc, relative_pose_errors, trajectory_errors
+from factorsfm.evaluation.readers import read_shot
+from factorsfm.evaluation.truth import Shot
+from factorsfm.set_mapper import SetMapper
+from factorsfm.synthetic import render_views, room_camera
+
+RESULTS = Path(__file__).parent / "results"
+WIDE = ("fountain-P11", "herzjesu-P8")
+NARROW = ("kitchen-000", "kitchen-528", "kitchen-840")
+EVERY = 3  # frame of the narrow ones, which are videos
+WIDTH, HEIGHT = 1600, 1066
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One measurement: a set, what reconstructs it (sift, xfeat, COLMAP), and whether the lens is given."""
+
+    name: str
+    method: str
+    known: bool = True
+
+    @property
+    def key(self) -> str:
+        """In the file of results."""
+        return f"{self.name} {self.method} {'known' if self.known else 'unknown'}"
+
+
+def rendered_path(count: int) -> list[pycolmap.Rigid3d]:
+    """Cameras on a round through the room that look to both sides on their way, (count,) cam_from_world."""
+    poses = []
+    for t in 2 * np.pi * np.arange(count) / count:
+        center = np.array([0.8 * np.sin(t), 0.35 * np.sin(5 * t), 0.5 + np.cos(t)])
+        turn = np.array([0.0, np.radians(50) * np.sin(2 * t), 0.0])
+        poses.append(pycolmap.Rigid3d(pycolmap.Rotation3d(turn), center).inverse())
+    return poses
+
+
+def measure(case: Case, data: Path, models: Path, work: Path) -> dict[str, Any]:
+    """Run a case in this process: errors, seconds by stage, CPU seconds, peak memory, cost by number of images."""
+    with tempfile.TemporaryDirectory() as temporary:
+        if case.name.startswith("rendered"):
+            poses = rendered_path(int(case.name.split("-")[1]))
+            folder = work / case.name
+            render(folder / "images", poses)
+            turns, centers = pose_arrays(poses)
+            outcome = _ours(folder / "images", room_camera(WIDTH, HEIGHT), "sift", folder / "work")
+        else:
+            step = EVERY if case.name in NARROW else 1
+            shot = read_shot(data / "real" / case.name)
+            frames = [frame for frame in shot.frames() if frame.index % step == 0]
+            turns, centers = shot.truth(np.array([frame.index for frame in frames]))
+            if case.method == "COLMAP":
+                outcome = _colmap(shot, frames, case.known, Path(temporary))
+            else:
+                features = models if case.method == "xfeat" else "sift"
+                outcome = _ours(frames, shot.camera if case.known else None, features, Path(temporary))
+    estimate = np.array(outcome.pop("turns")), np.array(outcome.pop("centers"))
+    found = np.isfinite(estimate[1]).all(axis=1)
+    errors = trajectory_errors(*estimate, turns, centers)
+    return outcome | {
+        "images": len(turns),
+        "registered": int(found.sum()),
+        "ate": float(np.sqrt(np.nanmean(errors.ate**2))),
+        "auc": float(auc(relative_pose_errors(*estimate, turns, centers), 1.0)),
+        "peak": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+    }
+
+
+def render(folder: Path, poses: list[pycolmap.Rigid3d]) -> None:
+    """Write the images that are not there yet."""
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = [folder / f"{k:04d}.png" for k in range(len(poses))]
+    missing = [k for k, path in enumerate(paths) if not path.exists()]
+    for k, image in zip(missing, render_views([poses[k] for k in missing], WIDTH, HEIGHT), strict=True):
+        cv2.imwrite(str(paths[k]), image)
+
+
+def _ours(source: Any, camera: pycolmap.Camera | None, features: Any, work: Path) -> dict[str, Any]:
+    trace: list[tuple[int, float]] = []
+    accept = SetMapper._accept
+
+    def traced(mapper: SetMapper, *arguments: Any) -> None:
+        accept(mapper, *arguments)
+        trace.append((mapper.registered, time.process_time()))
+
+    begin, used = time.perf_counter(), time.process_time()
+    with patch.object(SetMapper, "_accept", traced):
+        result = factorsfm.reconstruct(source, camera=camera, depth=None, unordered=True, features=features, work=work)
+    turns, centers = pose_arrays([frame.cam_from_world for frame in result.frames])
+    return {
+        "turns": turns,
+        "centers": centers,
+        "seconds": {k: v for k, v in result.seconds.items() if v > 0.05 and k != "total"},
+        "total": time.perf_counter() - begin,
+        "cpu": time.process_time() - used,
+        "points": len(result.points),
+        "trace": trace,
+    }
+
+
+def _colmap(shot: Shot, frames: list[factorsfm.Frame], known: bool, folder: Path) -> dict[str, Any]:
+    """Incremental mapping with default options; an unknown lens as COLMAP takes it, with its guess and distortion."""
+    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)
+    begin, used = time.perf_counter(), time.process_time()
+    if known:
+        found = colmap_default(match_frames(replace(shot, masks=None), frames, folder))
+        turns, centers, seconds = found.rotations, found.centers, dict(found.seconds)
+        points = len(found.points)
+    else:
+        (folder / "images").mkdir()
+        names = [f"{frame.index:06d}.png" for frame in frames]
+        for frame, name in zip(frames, names, strict=True):
+            cv2.imwrite(str(folder / "images" / name), frame.image)
+        database, times = folder / "database.db", [time.perf_counter()]
+        pycolmap.set_random_seed(0)
+        pycolmap.extract_features(database, folder / "images", camera_mode=pycolmap.CameraMode.SINGLE)
+        times.append(time.perf_counter())
+        pycolmap.match_exhaustive(database)
+        times.append(time.perf_counter())
+        models = pycolmap.incremental_mapping(database, folder / "images", folder)
+        times.append(time.perf_counter())
+        seconds = dict(zip(("extraction", "matching", "mapping"), np.diff(times).tolist(), strict=True))
+        model = max(models.values(), key=lambda m: m.num_reg_images())
+        by_name = {image.name: image for image in model.images.values() if image.has_pose}
+        turns, centers = pose_arrays([by_name[n].cam_from_world() if n in by_name else None for n in names])
+        points = model.num_points3D()
+    return {
+        "turns": turns,
+        "centers": centers,
+        "seconds": seconds,
+        "total": time.perf_counter() - begin,
+        "cpu": time.process_time() - used,
+        "points": points,
+    }
+
+
+# --- the tables -------------------------------------------------------------------------------------------------
+
+
+def growth(trace: list[list[float]]) -> tuple[Array, Array, float]:
+    """Registered images, CPU seconds of the mapper so far, and the exponent of the cost of an image.
+
+    The total grows with the power p + 1 of the number of images where the cost of one grows with p.
+    """
+    first = max(k for k, (count, _) in enumerate(trace) if count <= 1)  # of the start that was kept
+    images, seconds = np.array(trace[first:], np.float64).T
+    seconds = seconds - seconds[0]
+    late = images >= images[-1] / 4
+    exponent = float(np.polyfit(np.log(images[late]), np.log(np.maximum(seconds[late], 1e-3)), 1)[0]) - 1.0
+    return images, seconds, exponent
+
+
+def draw(found: dict[str, Any], command: str) -> None:
+    """Write SETS.md and its figure."""
+    text = ["# Image sets", "", f"`{command}`", ""]
+    text += [
+        "Wall time and CPU time (all threads) from images to poses; ATE: root mean square after alignment. COLMAP: its "
+        "incremental mapper with default options, SIFT on the CPU as here; a known lens is held fixed.", "",
+        "| set | lens | method | images | ATE mm | AUC at 1° | wall s | CPU s | of COLMAP's CPU s |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]  # fmt: skip
+    for case in real_cases():
+        if case.key in found:
+            r, other = found[case.key], found.get(replace(case, method="COLMAP").key)
+            ratio = f"{r['cpu'] / other['cpu']:.2f}" if other else ""
+            text.append(
+                f"| {case.name} | {'known' if case.known else 'unknown'} | {case.method} "
+                f"| {r['registered']}/{r['images']} | {1000 * r['ate']:.2f} | {r['auc']:.1f} "
+                f"| {r['total']:.0f} | {r['cpu']:.0f} | {ratio} |"
+            )
+    traced = {key: r for key, r in found.items() if key.startswith("rendered")}
+    if traced:
+        text += [
+            "", f"A rendered room, {WIDTH}x{HEIGHT} pixels, known lens. ATE as a share of the path's extent of 2.", "",
+            "| images | registered | points | ATE | wall s | by stage | CPU s | peak MB | cost of an image |",
+            "|---|---|---|---|---|---|---|---|---|",
+        ]  # fmt: skip
+        for r in sorted(traced.values(), key=lambda r: r["images"]):
+            stages = ", ".join(f"{name} {value:.0f}" for name, value in r["seconds"].items())
+            text.append(
+                f"| {r['images']} | {r['registered']} | {r['points']:,} | {r['ate'] / 2:.1e} | {r['total']:.0f} "
+                f"| {stages} | {r['cpu']:.0f} | {r['peak']:.0f} | n^{growth(r['trace'])[2]:.2f} |"
+            )
+        text += ["", "![Cost of an image against the registered images](sets_cost.png)"]
+        _plot(traced)
+    (RESULTS / "SETS.md").write_text("\n".join(text) + "\n", encoding="utf-8")
+
+
+def _plot(traced: dict[str, Any]) -> None:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(7, 4.2))
+    for r in sorted(traced.values(), key=lambda r: r["images"]):
+        images, seconds, exponent = growth(r["trace"])
+        window = max(2, len(images) // 10)
+        cost = (seconds[window:] - seconds[:-window]) / (images[window:] - images[:-window])
+        axes.plot(images[window:], cost, label=f"{r['images']} images: n^{exponent:.2f}")
+    axes.set(xlabel="registered images", ylabel="CPU seconds of the mapper for one image", xlim=0, ylim=0)
+    axes.legend()
+    figure.tight_layout()
+    figure.savefig(RESULTS / "sets_cost.png", dpi=130)
+    plt.close(figure)
+
+
+def real_cases() -> list[Case]:
+    """The photographs."""
+    wide = [Case(n, m, known) for n in WIDE for known in (True, False) for m in ("COLMAP", "sift")]
+    return wide + [Case(n, "xfeat") for n in WIDE] + [Case(n, m) for n in NARROW for m in ("COLMAP", "sift", "xfeat")]
+
+
+def main() -> None:
+    """Measure what is not measured yet and write the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--models", type=Path, required=True)
+    parser.add_argument("--images", type=int, nargs="*", default=[40, 200], help="sizes of the rendered set")
+    parser.add_argument("--work", type=Path, help="keep the rendered images, features and matches here")
+    parser.add_argument("--again", nargs="*", default=[], help="measure cases with this in their name again")
+    parser.add_argument("--only", default="", help="only cases with this in their name")
+    arguments = parser.parse_args()
+    stored = RESULTS / "sets.json"
+    found = json.loads(stored.read_text(encoding="utf-8")) if stored.exists() else {}
+    command = f"python -m benchmarks.sets --data FOLDER --models FOLDER --images {' '.join(map(str, arguments.images))}"
+    with tempfile.TemporaryDirectory() as temporary:
+        work = arguments.work or Path(temporary)
+        for case in [*real_cases(), *(Case(f"rendered-{n}", "sift") for n in arguments.images)]:
+            wanted = arguments.only in case.key
+            if not wanted or (case.key in found and not any(word in case.key for word in arguments.again)):
+                continue
+            with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+                outcome = pool.submit(measure, case, arguments.data, arguments.models, work).result()
+            found[case.key] = asdict(case) | outcome
+            print({key: value for key, value in found[case.key].items() if key != "trace"}, flush=True)
+            stored.write_text(json.dumps(found) + "\n", encoding="utf-8")
+    draw(found, command)
+
+
+if __name__ == "__main__":
+    main()
