@@ -12,9 +12,10 @@ import argparse
 import json
 import multiprocessing
 import resource
+import signal
+import sys
 import tempfile
 import time
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -253,6 +254,7 @@ def main() -> None:
     parser.add_argument("--again", nargs="*", default=[], help="measure cases with this in their name again")
     parser.add_argument("--only", default="", help="only cases with this in their name")
     arguments = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that no measurement outlives the run
     stored = RESULTS / "sets.json"
     found = json.loads(stored.read_text(encoding="utf-8")) if stored.exists() else {}
     command = f"python -m benchmarks.sets --data FOLDER --models FOLDER --images {' '.join(map(str, arguments.images))}"
@@ -262,8 +264,8 @@ def main() -> None:
             wanted = arguments.only in case.key
             if not wanted or (case.key in found and not any(word in case.key for word in arguments.again)):
                 continue
-            with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-                outcome = pool.submit(measure, case, arguments.data, arguments.models, work).result()
+            with multiprocessing.get_context("spawn").Pool(1) as pool:
+                outcome = pool.apply(measure, (case, arguments.data, arguments.models, work))
             found[case.key] = asdict(case) | outcome
             print({key: value for key, value in found[case.key].items() if key != "trace"}, flush=True)
             stored.write_text(json.dumps(found) + "\n", encoding="utf-8")
