@@ -266,6 +266,8 @@ def main() -> None:
                 continue
             with multiprocessing.get_context("spawn").Pool(1) as pool:
                 outcome = pool.apply(measure, (case, arguments.data, arguments.models, work))
+                pool.close()
+                pool.join()
             found[case.key] = asdict(case) | outcome
             print({key: value for key, value in found[case.key].items() if key != "trace"}, flush=True)
             stored.write_text(json.dumps(found) + "\n", encoding="utf-8")

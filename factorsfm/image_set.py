@@ -14,18 +14,20 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.camera import PIXEL_CENTER, guess_camera, lens_shape
-from factorsfm.errors import InputError, ReconstructionError
+from factorsfm.camera import PIXEL_CENTER, guess_camera, lens_shape, with_focal, with_lens
+from factorsfm.errors import ReconstructionError
 from factorsfm.frames import Frame, bgr_image
 from factorsfm.images import ImageTracks, MappedImage
+from factorsfm.lens import LensEstimate
 from factorsfm.options import Options
-from factorsfm.photos import Photo, PhotoFolder, size_text
+from factorsfm.photos import Photo, PhotoFolder
 from factorsfm.polish import polish
 from factorsfm.priors.depth import DepthKind, DepthPrior
 from factorsfm.priors.masks import MaskPrior
 from factorsfm.reading import read_depth, read_mask
 from factorsfm.reconstruction import FrameResult, FrameStatus, Reconstruction
 from factorsfm.result import assemble
+from factorsfm.set_cameras import describe_cameras, find_cameras
 from factorsfm.set_mapper import SetMapper, map_parts
 from factorsfm.threads import OneThreadEach
 from factorsfm.tracks.learned import LearnedFeatures
@@ -36,19 +38,20 @@ Progress = Callable[[str, int, int | None], None]
 
 logger = logging.getLogger(__name__)
 
-_SAME_ASPECT = 0.01
 _LEAST_KEYPOINTS = 30
 
 
 class ImageSet:
-    """Reconstruction of an unordered set of photographs from one camera.
+    """Reconstruction of an unordered set of photographs.
 
     Images of another size but the same aspect ratio count as scaled, upright ones in a set of landscape format (or the
-    reverse) are turned; images with another aspect ratio are left out, since the set has one lens.
+    reverse) are turned; images with another aspect ratio, or with another focal length in their EXIF data, come from a
+    camera of their own (`set_cameras`).
 
     Args:
         folder: working copies, features and matches lie here; a second run with the same images goes on from them.
-        camera: the lens; None takes the focal length from the EXIF data or a guess, and refines it.
+        camera: the lens of its format; None takes the focal length from the EXIF data or a guess, and refines it.
+            Focal lengths are refined by a common factor.
         depth: prior, or None.
         masks: what to ignore, or None.
         features: "sift"; the name of learned ones, see `tracks.learned.FEATURES`; or a folder with their networks.
@@ -82,7 +85,7 @@ class ImageSet:
         self._features = None if str(features) == "sift" else LearnedFeatures(features)
         self._database = folder / ("matches.db" if self._features is None else f"matches-{self._features.name}.db")
         self._files = PhotoFolder(folder, masked=masks is not None)
-        self._focal_ratios: list[float] = []
+        self._cameras: list[pycolmap.Camera] = []  # of the images at full size, that of the map's pixels first
 
     def add(self, frame: Frame) -> None:
         """Take an image.
@@ -96,10 +99,10 @@ class ImageSet:
         with self._timed("reading"):
             photo = self._files.keep(frame, image, mask, len(self.photos))
             self.photos.append(photo)
-            if self.camera is None and frame.path is not None:
+            if frame.path is not None:
                 guess = guess_camera(*photo.full_size, frame.path)
                 if guess.has_prior_focal_length:
-                    self._focal_ratios.append(guess.focal_length / max(photo.full_size))
+                    photo.focal_ratio = guess.focal_length / max(photo.full_size)
 
     def note(self, sentence: str) -> None:
         """Take note of something that a user should read in the result."""
@@ -115,16 +118,16 @@ class ImageSet:
         """Match, map and polish.
 
         Raises:
-            InputError: the camera is made for images of another format.
+            InputError: the camera is made for images of another format than any of these.
             ReconstructionError: fewer than two images can be used or registered.
         """
         report: Progress = progress or (lambda stage, done, total: None)
-        camera = self._fit_together()
+        camera = self._find_cameras()
         used = [k for k, photo in enumerate(self.photos) if not photo.left_out and photo.twin is None]
         if len(used) < 2:
             raise self._failure(f"{len(used)} of {len(self.photos)} images can be used, at least 2 needed", [])
         report("matching", 0, None)
-        tracks, pixels = self._match(used, camera)
+        tracks, pixels = self._match(used)
         colors = self._look_up(used, tracks, pixels, report)
         report("mapping", 0, None)
         focal = 0.5 * (camera.focal_length_x + camera.focal_length_y)
@@ -146,47 +149,24 @@ class ImageSet:
         result.others = others
         return result
 
-    # --- one camera ---------------------------------------------------------------------------------------------
+    # --- cameras ------------------------------------------------------------------------------------------------
 
-    def _fit_together(self) -> pycolmap.Camera:
-        """The camera of the working copies; images of another format are turned or left out."""
+    def _find_cameras(self) -> pycolmap.Camera:
+        """The first camera at the size of its working copies; its pixels are those of the map's errors."""
         photos = [photo for photo in self.photos if not photo.left_out]
         if not photos:
             raise self._failure("there is no image that can be read", [])
-        if self.camera is None:
-            width, height = Counter(photo.full_size for photo in photos).most_common(1)[0][0]
-            self.camera = guess_camera(width, height)
-            if self._focal_ratios:
-                self.camera.focal_length = float(np.median(self._focal_ratios)) * max(width, height)
-                self.camera.has_prior_focal_length = True
-        full = (int(self.camera.width), int(self.camera.height))
-        for photo in photos:
-            if not _same_format(photo.full_size, full) and not _same_format(photo.full_size[::-1], full):
-                photo.left_out = (
-                    f"{size_text(photo.full_size)} pixels, another format than {size_text(full)} of the camera"
-                )
-                logger.warning("%s is left out: %s", photo.name, photo.left_out)
-            elif not _same_format(photo.full_size, full):
-                self._files.turn(photo)
-        fitting = [photo for photo in photos if not photo.left_out]
-        if not fitting:
-            raise InputError(
-                f"the camera is made for {size_text(full)} pixels, but none of the {len(photos)} images has this format"
-            )
-        camera = pycolmap.Camera(self.camera.todict())
-        width, height = Counter(photo.size for photo in fitting).most_common(1)[0][0]
-        camera.rescale(width, height)
-        return camera
+        self._cameras = find_cameras(photos, self._files, self.camera)
+        if sentence := describe_cameras(self._cameras, photos, self.camera is not None):
+            self.note(sentence)
+        sizes = Counter(photo.size for photo in photos if photo.camera == 0)
+        return _resized(self._cameras[0], sizes.most_common(1)[0][0])
 
     # --- steps --------------------------------------------------------------------------------------------------
 
-    def _match(self, used: list[int], camera: pycolmap.Camera) -> tuple[list[ImageTracks], list[Array]]:
-        """Tracks of all images, normalised, and their pixels as `camera` sees them."""
-        cameras = []
-        for k in used:
-            own = pycolmap.Camera(camera.todict())
-            own.rescale(*self.photos[k].size)
-            cameras.append(own)
+    def _match(self, used: list[int]) -> tuple[list[ImageTracks], list[Array]]:
+        """Tracks of all images, normalised, and their pixels at the full size of their cameras."""
+        cameras = [_resized(self._cameras[self.photos[k].camera], self.photos[k].size) for k in used]
         names = [self.photos[k].file for k in used]
         with self._timed("matching"):
             matches = match_images(
@@ -201,7 +181,8 @@ class ImageSet:
                 self.photos[k].remark = f"{len(keypoints)} of {_LEAST_KEYPOINTS} needed keypoints: hardly any texture"
             xy = np.asarray(own.cam_from_img(keypoints[rows] + PIXEL_CENTER), np.float64).reshape(-1, 2)
             good = np.isfinite(xy).all(axis=1)
-            scale = np.array([camera.width, camera.height]) / self.photos[k].size
+            full = self._cameras[self.photos[k].camera]
+            scale = np.array([full.width, full.height]) / self.photos[k].size
             tracks[k] = ImageTracks(k, ids[good], xy[good])
             pixels[k] = (keypoints[rows][good] + PIXEL_CENTER) * scale - PIXEL_CENTER
         return tracks, pixels
@@ -212,12 +193,12 @@ class ImageSet:
         """Depth of the tracks, in place, and their colours (RGB by track id)."""
         count = max((int(t.ids[-1]) + 1 for t in tracks if len(t.ids)), default=0)
         colors = np.zeros((count, 3), np.uint8)
-        size = Counter(self.photos[k].size for k in used).most_common(1)[0][0]
         for done, k in enumerate(used):
             progress("depth", done, len(used))
             photo = self.photos[k]
             image = self._files.read(photo)
-            scale = np.array(photo.size) / size
+            full = self._cameras[photo.camera]
+            scale = np.array(photo.size) / [full.width, full.height]
             xy = (pixels[k] + PIXEL_CENTER) * scale - PIXEL_CENTER
             x, y = np.clip(np.rint(xy).astype(int), 0, np.array(photo.size) - 1).T
             colors[tracks[k].ids] = image[y, x][:, ::-1]
@@ -251,14 +232,14 @@ class ImageSet:
             self.photos,
             pixels,
             colors,
-            pycolmap.Camera(camera.todict()),
+            camera,
             lens_given=self._lens_given,
             prior_given=self._depth is not None,
             metric=self._depth is not None and self._depth.kind is DepthKind.METRIC,
             seconds={},
             options=self.options.to_dict(),
         )
-        self._at_full_size(result)
+        self._add_lenses(result, camera, polished.lens)
         self._add_twins(result)
         return result
 
@@ -292,19 +273,28 @@ class ImageSet:
             elif photo.remark and frame.registered:
                 frame.message += f"; {photo.remark}"
 
-    def _at_full_size(self, result: Reconstruction) -> None:
-        """The result speaks of the images' own pixels, not of those of the working copies."""
-        assert self.camera is not None
-        factor = self.camera.width / result.camera.width
-        if factor != 1.0:
-            result.camera.rescale(int(self.camera.width), int(self.camera.height))
-            result.observation_xy = (result.observation_xy + PIXEL_CENTER) * factor - PIXEL_CENTER
-            result.observation_error = result.observation_error * factor
-            for frame in result.frames:
-                frame.reprojection_error *= factor
-                if frame.observability is not None:
-                    slide = frame.observability.pixel_slide * factor
-                    frame.observability = replace(frame.observability, pixel_slide=slide)
+    def _add_lenses(self, result: Reconstruction, first: pycolmap.Camera, lens: LensEstimate | None) -> None:
+        """The lenses of the images at full size, and errors in their pixels instead of those of the map."""
+        ratio = result.camera.mean_focal_length() / first.mean_focal_length()
+        shape = lens.lens.shape if lens is not None and self.camera is None else np.zeros(4)
+        lenses = []
+        for k, camera in enumerate(self._cameras):
+            focal = ratio * camera.mean_focal_length()
+            own = with_lens(camera, focal, shape) if shape.any() else with_focal(camera, focal)
+            lenses.append(_resized(result.camera, (camera.width, camera.height)) if k == 0 else own)
+        shared = Counter(p.camera for p, f in zip(self.photos, result.frames, strict=True) if f.registered)
+        most = shared.most_common(1)[0][0]
+        factor = np.array([lenses[photo.camera].mean_focal_length() for photo in self.photos])
+        factor /= result.camera.mean_focal_length()
+        result.camera = lenses[most]
+        result.observation_error = result.observation_error * factor[result.observation_frame]
+        for frame, photo, own_factor in zip(result.frames, self.photos, factor.tolist(), strict=True):
+            if photo.camera != most:
+                frame.camera = lenses[photo.camera]
+            frame.reprojection_error *= own_factor
+            if frame.observability is not None:
+                slide = frame.observability.pixel_slide * own_factor
+                frame.observability = replace(frame.observability, pixel_slide=slide)
 
     def _summary(self, result: Reconstruction, number: int, parts: list[SetMapper]) -> list[str]:
         notes = [f"{photo.name}: {photo.left_out}." for photo in self.photos if photo.left_out]
@@ -357,5 +347,8 @@ def _for_image_sets(options: Options) -> Options:
     )
 
 
-def _same_format(size: tuple[int, int], other: tuple[int, int]) -> bool:
-    return abs(size[0] * other[1] / (size[1] * other[0]) - 1.0) < _SAME_ASPECT
+def _resized(camera: pycolmap.Camera, size: tuple[int, int]) -> pycolmap.Camera:
+    """A copy for images of another size."""
+    other = pycolmap.Camera(camera.todict())
+    other.rescale(*size)
+    return other

@@ -29,6 +29,8 @@ class Photo:
         full_size: (width, height) of the image itself.
         left_out: why it takes no part, empty where it does; twin: position of an earlier image with the same pixels.
         remark: what a user should know of it.
+        focal_ratio: focal length over the longer side from EXIF, 0 where it is unknown.
+        camera: position in the list of the set's cameras.
     """
 
     index: int
@@ -40,6 +42,8 @@ class Photo:
     left_out: str = ""
     twin: int | None = None
     remark: str = ""
+    focal_ratio: float = 0.0
+    camera: int = 0
 
 
 class PhotoFolder:

@@ -22,7 +22,7 @@ class FrameStatus(StrEnum):
     LOST = "lost"  # what the image shows is not in the map
     BLANK = "blank"  # black, white or blurred: no texture to track
     WAITING = "waiting"  # not yet initialised
-    UNUSABLE = "unusable"  # of an image set: unreadable, or from another camera
+    UNUSABLE = "unusable"  # of an image set: unreadable
 
 
 class ShotKind(StrEnum):
@@ -116,6 +116,7 @@ class FrameResult:
             points; None where not registered, or where no point of the result is seen.
         observability: what carries the pose, None where not registered.
         thumbnail: a small JPEG of the image, None where none is kept.
+        camera: the lens of this frame where the frames do not share one, else None; see `Reconstruction.camera_of`.
     """
 
     index: int
@@ -132,6 +133,7 @@ class FrameResult:
     covariance: NDArray[np.float64] | None = None
     observability: CameraObservability | None = None
     thumbnail: bytes | None = None
+    camera: pycolmap.Camera | None = None
 
     @property
     def registered(self) -> bool:
@@ -144,7 +146,7 @@ class Reconstruction:
     """Cameras, points and tracks of one shot.
 
     Attributes:
-        camera: the lens, shared by all frames (COLMAP convention: pixel centres at 0.5).
+        camera: the lens (COLMAP convention: pixel centres at 0.5) of all frames but those with one of their own.
         frames: one entry per frame of the source, in order.
         points: (n, 3) world coordinates.
         colors: (n, 3) uint8 RGB.
@@ -191,6 +193,15 @@ class Reconstruction:
     def registered(self) -> list[FrameResult]:
         """The frames that have a pose."""
         return [frame for frame in self.frames if frame.registered]
+
+    def camera_of(self, frame: FrameResult) -> pycolmap.Camera:
+        """The lens with which a frame was taken."""
+        return frame.camera or self.camera
+
+    @property
+    def has_own_lenses(self) -> bool:
+        """Whether some frames have a lens of their own."""
+        return any(frame.camera is not None for frame in self.frames)
 
     def camera_centers(self) -> NDArray[np.float64]:
         """(k, 3) centres of the registered cameras, world coordinates."""

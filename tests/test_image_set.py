@@ -11,17 +11,30 @@ import numpy as np
 import pycolmap
 import pytest
 
-from factorsfm import Frame, FrameStatus, InputError, Options, ReconstructionError, cli, read_result, reconstruct
-from factorsfm.camera import camera_to_json
+from factorsfm import (
+    ExportOptions,
+    Frame,
+    FrameStatus,
+    InputError,
+    Options,
+    ReconstructionError,
+    cli,
+    read_result,
+    reconstruct,
+)
+from factorsfm.camera import camera_to_json, guess_camera
 from factorsfm.evaluation.alignment import pose_arrays
 from factorsfm.evaluation.metrics import TrajectoryErrors, auc, relative_pose_errors, trajectory_errors
 from factorsfm.evaluation.readers import read_shot
+from factorsfm.export import export
 from factorsfm.image_set import ImageSet, _for_image_sets
 from factorsfm.images import ImageTracks
+from factorsfm.photos import Photo, PhotoFolder
 from factorsfm.polish import Polished, polish
 from factorsfm.registration import ImageDepth
+from factorsfm.set_cameras import find_cameras
 from factorsfm.set_mapper import SetMapper, map_parts
-from factorsfm.synthetic import RenderedShot, render_shot
+from factorsfm.synthetic import RenderedShot, render_shot, render_views, room_camera
 from factorsfm.unordered import Unusable, looks_unordered, other_files, read_images
 
 FOCAL = 800.0
@@ -232,7 +245,7 @@ def test_odd_files_are_told_and_do_not_stop_the_rest(
     cv2.imwrite(str(tmp_path / "flat.png"), np.full((300, 400), 128, np.uint8))
     cv2.imwrite(str(tmp_path / "ztree.png"), shot.images[4])
     cv2.imwrite(str(tmp_path / "large.png"), cv2.resize(shot.images[2], (1200, 900), interpolation=cv2.INTER_CUBIC))
-    cv2.imwrite(str(tmp_path / "square.png"), shot.images[2][:, :300])
+    cv2.imwrite(str(tmp_path / "square.png"), shot.images[2][:, 50:350])
     cv2.imwrite(str(tmp_path / "upright.png"), cv2.rotate(shot.images[3], cv2.ROTATE_90_CLOCKWISE))
     sideways = cv2.rotate(shot.images[3], cv2.ROTATE_90_CLOCKWISE)
     (tmp_path / "exif.jpg").write_bytes(jpeg_with_orientation(sideways, 8))
@@ -244,7 +257,8 @@ def test_odd_files_are_told_and_do_not_stop_the_rest(
     twins = {"grey": "cat", "ztree": "tree", "large": "door", "upright": "house", "exif": "house"}
     truth |= {name: truth[other] for name, other in twins.items()}
     posed = [frame for frame in result.frames if frame.registered]
-    assert {Path(frame.name).stem for frame in posed} == set(truth)
+    assert {Path(frame.name).stem for frame in posed} == {*truth, "square"}
+    posed.remove(frames["square.png"])  # from a lens that is guessed
     estimate = pose_arrays([frame.cam_from_world for frame in posed])
     expected = pose_arrays([truth[Path(frame.name).stem] for frame in posed])
     length = np.linalg.norm(expected[1][:, None] - expected[1], axis=2).max()
@@ -255,21 +269,120 @@ def test_odd_files_are_told_and_do_not_stop_the_rest(
     assert frames["cut.jpg"].status is frames["text.jpg"].status is FrameStatus.UNUSABLE
     assert "truncated" in frames["cut.jpg"].message
     assert "cannot be decoded" in frames["text.jpg"].message
-    assert frames["square.png"].status is FrameStatus.UNUSABLE
-    assert "300x300 pixels, another format than 400x300" in frames["square.png"].message
+    assert result.has_own_lenses
+    assert result.camera_of(frames["square.png"]).width == 300
+    assert result.camera_of(frames["large.png"]) is result.camera
     assert frames["flat.png"].status is FrameStatus.BLANK
     assert "0 of 30 needed keypoints" in frames["flat.png"].message
     assert "the same image as tree.png" in frames["ztree.png"].message
     assert "reduced from 1200x900 to 600x450" in frames["large.png"].message
     assert "turned left" in frames["upright.png"].message
     text = "\n".join(result.notes)
-    for word in ("notes.txt", "cut.jpg", "text.jpg", "square.png", "large.png", "ztree.png", "flat.png"):
+    assert "2 cameras: 11 of 400x300 pixels" in text
+    assert "1 of 300x300 pixels with a focal length of 322 (a guess)" in text
+    for word in ("notes.txt", "cut.jpg", "text.jpg", "large.png", "ztree.png", "flat.png"):
         assert word in text
     assert result.camera.width == 400
     assert (result.observation_xy < [400, 300]).all()
     assert len(result.colors) == len(result.points) > 200
     result.write(tmp_path / "out")
     assert (tmp_path / "out" / "trajectory.tum").read_text().count("\n") >= len(posed)
+
+
+def jpeg_with_focal_length(image: np.ndarray, equivalent_mm: int) -> bytes:
+    data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 97])[1].tobytes()
+    entry = b"\x01\0" + struct.pack("<HHII", 0xA405, 3, 1, equivalent_mm)
+    exif = b"Exif\0\0II*\0\x08\0\0\0\x01\0" + struct.pack("<HHII", 0x8769, 4, 1, 26) + bytes(4) + entry + bytes(4)
+    return data[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + data[2:]
+
+
+def test_images_of_two_cameras(tmp_path: Path) -> None:
+    """Every other image is square; what EXIF says of both focal lengths is right to a tenth of a percent."""
+    centers = np.stack([np.linspace(-0.5, 0.5, 6), np.zeros(6), np.zeros(6)], 1)
+    poses = [pycolmap.Rigid3d(pycolmap.Rotation3d(), c).inverse() for c in centers]
+    for k, pose in enumerate(poses):
+        width, equivalent_mm = ((400, 34), (300, 30))[k % 2]
+        (image,) = render_views([pose], width, 300)
+        (tmp_path / f"{k}.jpg").write_bytes(jpeg_with_focal_length(image, equivalent_mm))
+
+    result = reconstruct(tmp_path, depth=None, unordered=True, lens="fixed")
+    assert len(result.registered) == 6
+    for k, frame in enumerate(result.frames):
+        camera, width = result.camera_of(frame), (400, 300)[k % 2]
+        assert (camera.width, camera.height) == (width, 300)
+        assert camera.focal_length_x == pytest.approx(room_camera(width, 300).focal_length_x, rel=0.002)
+    turns = np.tile(np.eye(3), (6, 1, 1))
+    errors = trajectory_errors(*pose_arrays([frame.cam_from_world for frame in result.frames]), turns, centers)
+    assert errors.ate.max() < 0.008  # of a path of length 1; the guess for the square images is off by 9 %
+    assert errors.r_rpe.max() < 0.1
+    mine = [frame.reprojection_error for frame in result.frames]
+    assert 0.03 < min(mine) <= max(mine) < 0.5
+    assert any("3 of 300x300 pixels with a focal length of 294 (from EXIF)" in note for note in result.notes)
+
+    result.write(tmp_path / "out")
+    again = read_result(tmp_path / "out")
+    for frame, other in zip(result.frames, again.frames, strict=True):
+        assert again.camera_of(other).params.tolist() == result.camera_of(frame).params.tolist()
+    # The errors in the file are those of the lenses in the file.
+    assert np.median(again.observation_error) == pytest.approx(np.median(result.observation_error), rel=0.02)
+    export(again, tmp_path / "splats", format="nerfstudio", options=ExportOptions(footage=tmp_path))
+    written = json.loads((tmp_path / "splats" / "transforms.json").read_text())
+    assert "w" not in written
+    assert [frame["w"] for frame in written["frames"]] == [400, 300] * 3
+    with pytest.raises(InputError, match="chan is for images of one size, and these have 2"):
+        export(again, tmp_path / "out.chan", format="chan")
+
+
+class Turned(PhotoFolder):
+    """Takes note of what is turned, without files."""
+
+    def __init__(self) -> None:
+        self.turned: list[str] = []
+
+    def turn(self, photo: Photo) -> None:
+        self.turned.append(photo.name)
+
+
+def photo(name: str, size: tuple[int, int], focal_ratio: float = 0.0) -> Photo:
+    return Photo(0, name, None, size=size, full_size=size, focal_ratio=focal_ratio)
+
+
+def test_format_and_focal_length_tell_cameras_apart() -> None:
+    photos = [
+        *(photo(f"wide{k}", (400, 300), 0.8) for k in range(3)),
+        *(photo(f"tele{k}", (400, 300), 2.0 + 0.002 * k) for k in range(2)),
+        photo("untold", (400, 300)),
+        photo("scaled", (800, 600), 0.8),
+        photo("upright", (300, 400), 2.0),
+        photo("square", (300, 300)),
+    ]
+    files = Turned()
+    wide, tele, square = find_cameras(photos, files, None)
+    assert [p.camera for p in photos] == [0, 0, 0, 1, 1, 0, 0, 1, 2]
+    assert files.turned == ["upright"]
+    assert (wide.width, wide.focal_length) == (400, pytest.approx(320.0))
+    assert (tele.width, tele.focal_length) == (400, pytest.approx(800.0, rel=0.002))
+    assert square == guess_camera(300, 300)
+
+    given = room_camera(400, 300)
+    cameras = find_cameras(photos, Turned(), given)
+    assert [p.camera for p in photos] == [0] * 8 + [1]
+    assert cameras == [given, guess_camera(300, 300)]
+
+
+@pytest.mark.slow
+def test_an_image_of_100_megapixels_is_reduced(shot: RenderedShot, tmp_path: Path) -> None:
+    (tmp_path / "images").mkdir()
+    huge = cv2.resize(shot.images[0], (12000, 9000), interpolation=cv2.INTER_NEAREST)
+    cv2.imwrite(str(tmp_path / "images" / "huge.jpg"), huge)
+    images = ImageSet(tmp_path / "work", shot.camera)
+    for image in read_images(tmp_path / "images"):
+        assert isinstance(image, Frame)
+        images.add(image)
+    (huge_photo,) = images.photos
+    assert huge_photo.size == (3200, 2400)
+    assert huge_photo.remark == "reduced from 12000x9000 to 3200x2400 pixels"
+    assert cv2.imread(str(tmp_path / "work" / "images" / huge_photo.file)).shape == (2400, 3200, 3)
 
 
 def test_two_scenes_make_two_results(shot: RenderedShot, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

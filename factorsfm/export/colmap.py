@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 
 from factorsfm.reconstruction import Reconstruction
 
-_CAMERA_ID = 1
-
 
 class _Observations(NamedTuple):
     """The observations that are written, sorted by frame; all arrays (k,) but `xy` (k, 2)."""
@@ -37,13 +35,16 @@ def write_colmap(reconstruction: Reconstruction, folder: str | Path) -> None:
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     observations = _observations(reconstruction)
-    camera = reconstruction.camera
-    lens = (_CAMERA_ID, camera.model_name, camera.width, camera.height, *map(_exact, camera.params))
-    _write_lines(folder / "cameras.txt", "CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", [_join(lens)])
+    cameras = _cameras(reconstruction)
+    lenses = [
+        _join((camera_id, camera.model_name, camera.width, camera.height, *map(_exact, camera.params)))
+        for camera_id, camera in enumerate(cameras, 1)
+    ]
+    _write_lines(folder / "cameras.txt", "CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", lenses)
     _write_lines(
         folder / "images.txt",
         "IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; next line: POINTS2D[] as (X, Y, POINT3D_ID)",
-        _image_lines(reconstruction, observations),
+        _image_lines(reconstruction, observations, cameras),
     )
     _write_lines(
         folder / "points3D.txt",
@@ -85,7 +86,18 @@ def _observations(reconstruction: Reconstruction) -> _Observations:
     )
 
 
-def _image_lines(reconstruction: Reconstruction, observations: _Observations) -> list[str]:
+def _cameras(reconstruction: Reconstruction) -> list[pycolmap.Camera]:
+    """The different lenses of the registered frames, that of the reconstruction first."""
+    cameras = [reconstruction.camera]
+    for frame in reconstruction.registered:
+        if frame.camera is not None and frame.camera not in cameras:
+            cameras.append(frame.camera)
+    return cameras
+
+
+def _image_lines(
+    reconstruction: Reconstruction, observations: _Observations, cameras: list[pycolmap.Camera]
+) -> list[str]:
     points2d = [
         f"{x:.6f} {y:.6f} {point + 1}"
         for (x, y), point in zip(observations.xy.tolist(), observations.point.tolist(), strict=True)
@@ -96,7 +108,8 @@ def _image_lines(reconstruction: Reconstruction, observations: _Observations) ->
         if frame.cam_from_world is not None:
             qx, qy, qz, qw = frame.cam_from_world.rotation.quat
             pose = map(_exact, (qw, qx, qy, qz, *frame.cam_from_world.translation))
-            lines.append(_join((frame.index + 1, *pose, _CAMERA_ID, _image_name(frame.name))))
+            camera_id = 1 + cameras.index(reconstruction.camera_of(frame))
+            lines.append(_join((frame.index + 1, *pose, camera_id, _image_name(frame.name))))
             lines.append(_join(points2d[start:stop]))
     return lines
 

@@ -80,6 +80,9 @@ FORMATS = {
 }
 
 
+_ANY_SIZES = ("colmap", "colmap-binary", "nerfstudio", "ply", "tum", "kitti")  # the others have one film back
+
+
 def export(
     reconstruction: Reconstruction, path: str | Path, *, format: str, options: ExportOptions | None = None
 ) -> None:
@@ -99,6 +102,11 @@ def export(
     if not reconstruction.registered:
         raise InputError("no frame is registered; there is nothing to export")
     chosen = FORMATS[format]
+    sizes = {(c.width, c.height) for c in map(reconstruction.camera_of, reconstruction.registered)}
+    if len(sizes) > 1 and format not in _ANY_SIZES:
+        raise InputError(
+            f"{format} is for images of one size, and these have {len(sizes)}; {', '.join(_ANY_SIZES)} take them"
+        )
     shot = make_shot(reconstruction, options or ExportOptions(), chosen.defaults)
     with (complete_folder if chosen.is_folder else complete_file)(Path(path)) as place:
         chosen.write(shot, place)

@@ -43,12 +43,19 @@ def write_nerfstudio(shot: Shot, folder: Path) -> None:
     Raises:
         InputError: nerfstudio does not know the lens model, or the footage lacks frames.
     """
-    names = {frame.index: _image_name(frame.name) for frame in shot.reconstruction.registered}
+    r = shot.reconstruction
+    names = {frame.index: _image_name(frame.name) for frame in r.registered}
+    lenses = [_lens(r.camera_of(frame)) for frame in r.registered]
+    models = {lens.pop("camera_model") for lens in lenses}
+    if len(models) > 1:
+        raise InputError(f"nerfstudio takes lenses of one model, not {' and '.join(sorted(models))} together")
+    shared = {} if r.has_own_lenses else lenses[0]  # nerfstudio takes what all share before what a frame has
     content = {
-        **_lens(shot.reconstruction.camera),
+        "camera_model": models.pop(),
+        **shared,
         "frames": [
-            {"file_path": f"images/{name}", "transform_matrix": matrix}
-            for name, matrix in zip(names.values(), shot.world_from_film, strict=True)
+            {"file_path": f"images/{name}", "transform_matrix": matrix, **({} if shared else lens)}
+            for name, matrix, lens in zip(names.values(), shot.world_from_film, lenses, strict=True)
         ],
         "ply_file_path": "points.ply",
         "applied_transform": np.column_stack([shot.world, np.zeros(3)]),
@@ -83,17 +90,18 @@ def _lens(camera: pycolmap.Camera) -> dict[str, Any]:
 def _write_images(footage: Path, names: dict[int, str], folder: Path) -> None:
     """Image files are copied as they are, frames of a video are written without loss."""
     folder.mkdir()
-    missing = set(names)
-    indices = sorted(names)
+    missing = {index for index, name in names.items() if not (footage / name).is_file()}
+    for index in names.keys() - missing:
+        shutil.copyfile(footage / names[index], folder / names[index])
+    if not missing:
+        return
+    indices = sorted(missing)
     for frame in read_frames(footage, slice(indices[0], indices[-1] + 1)):
         if frame.index not in missing:
             continue
         missing.remove(frame.index)
         target = folder / names[frame.index]
-        original = footage / frame.name
-        if footage.is_dir() and original.suffix == target.suffix:
-            shutil.copyfile(original, target)
-        elif not cv2.imwrite(str(target), frame.image):
+        if not cv2.imwrite(str(target), frame.image):
             raise OSError(f"the image {target.name} cannot be written")
     if missing:
         raise InputError(f"the footage {footage} lacks frame {min(missing)}, counted from 0")

@@ -59,7 +59,10 @@ def _reconstruction(content: dict[str, Any], model: pycolmap.Reconstruction) -> 
     point_ids = sorted(model.points3D)
     row_of_point = {point_id: row for row, point_id in enumerate(point_ids)}
     points = [model.points3D[point_id] for point_id in point_ids]
-    (camera,) = model.cameras.values()
+    camera = model.cameras[1]
+    for frame in frames:
+        if frame.cam_from_world is not None and images[frame.index].camera_id != 1:
+            frame.camera = model.cameras[images[frame.index].camera_id]
 
     frame_of, point_of, xy, error = [], [], [np.empty((0, 2))], [np.empty(0)]
     for position, frame in enumerate(frames):
@@ -74,7 +77,7 @@ def _reconstruction(content: dict[str, Any], model: pycolmap.Reconstruction) -> 
         point_of += rows
         xy.append(pixels - PIXEL_CENTER)
         in_camera = frame.cam_from_world * np.array([points[row].xyz for row in rows])
-        error.append(np.linalg.norm(camera.img_from_cam(in_camera) - pixels, axis=1))
+        error.append(np.linalg.norm((frame.camera or camera).img_from_cam(in_camera) - pixels, axis=1))
     return Reconstruction(
         camera=camera,
         frames=frames,

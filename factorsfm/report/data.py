@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 
 from factorsfm.reconstruction import FrameResult, Reconstruction
@@ -38,7 +39,8 @@ def reconstruction_data(reconstruction: Reconstruction) -> dict[str, Any]:
         "rotations": _base64(view.rotations, "<f4"),
         "positions": view.positions,
         "tracks": _tracks_data(
-            tracks(reconstruction, view, _MAX_OBSERVATIONS), len(reconstruction.frames), camera.width, camera.height
+            tracks(reconstruction, view, _MAX_OBSERVATIONS),
+            [reconstruction.camera_of(f) for f in reconstruction.frames],
         ),
     }
 
@@ -62,11 +64,12 @@ def frames_data(
     }
 
 
-def _tracks_data(found: Tracks, frames: int, width: int, height: int) -> dict[str, Any]:
+def _tracks_data(found: Tracks, cameras: Sequence[pycolmap.Camera]) -> dict[str, Any]:
     """Places as 16-bit fractions of the image, residuals and the prior's relative residuals as 16-bit steps."""
-    place = (found.xy + 0.5) / [width, height]
+    sizes = np.array([(camera.width, camera.height) for camera in cameras])
+    place = (found.xy + 0.5) / sizes[found.position]
     return {
-        "start": np.searchsorted(found.position, np.arange(frames + 1)),
+        "start": np.searchsorted(found.position, np.arange(len(cameras) + 1)),
         "point": _base64(found.point, "<u2"),
         "place": _base64(np.clip(np.round(65535 * place), 0, 65535), "<u2"),
         "residual": _base64(_steps(found.residual, _RESIDUAL_STEPS), "<i2"),
