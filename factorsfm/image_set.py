@@ -153,12 +153,15 @@ class ImageSet:
 
     def _find_cameras(self) -> pycolmap.Camera:
         """The first camera at the size of its working copies; its pixels are those of the map's errors."""
-        photos = [photo for photo in self.photos if not photo.left_out]
+        photos = [photo for photo in self.photos if not photo.left_out and photo.twin is None]
         if not photos:
             raise self._failure("there is no image that can be read", [])
         self._cameras = find_cameras(photos, self._files, self.camera)
         if sentence := describe_cameras(self._cameras, photos, self.camera is not None):
             self.note(sentence)
+        for photo in self.photos:
+            if photo.twin is not None:
+                photo.camera = self.photos[photo.twin].camera
         sizes = Counter(photo.size for photo in photos if photo.camera == 0)
         return _resized(self._cameras[0], sizes.most_common(1)[0][0])
 

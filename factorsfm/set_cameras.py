@@ -55,7 +55,7 @@ def describe_cameras(cameras: Sequence[pycolmap.Camera], photos: Sequence[Photo]
         return ""
     said = []
     for k, camera in enumerate(cameras):
-        count = sum(photo.camera == k and not photo.left_out for photo in photos)
+        count = sum(photo.camera == k for photo in photos)
         origin = "given" if given and k == 0 else "from EXIF" if camera.has_prior_focal_length else "a guess"
         size = size_text((camera.width, camera.height))
         said.append(f"{count} of {size} pixels with a focal length of {camera.mean_focal_length():.0f} ({origin})")

@@ -278,7 +278,7 @@ def test_odd_files_are_told_and_do_not_stop_the_rest(
     assert "reduced from 1200x900 to 600x450" in frames["large.png"].message
     assert "turned left" in frames["upright.png"].message
     text = "\n".join(result.notes)
-    assert "2 cameras: 11 of 400x300 pixels" in text
+    assert "2 cameras: 10 of 400x300 pixels" in text
     assert "1 of 300x300 pixels with a focal length of 322 (a guess)" in text
     for word in ("notes.txt", "cut.jpg", "text.jpg", "large.png", "ztree.png", "flat.png"):
         assert word in text
@@ -368,6 +368,17 @@ def test_format_and_focal_length_tell_cameras_apart() -> None:
     cameras = find_cameras(photos, Turned(), given)
     assert [p.camera for p in photos] == [0] * 8 + [1]
     assert cameras == [given, guess_camera(300, 300)]
+
+
+def test_a_duplicate_that_lies_on_its_side(shot: RenderedShot, tmp_path: Path) -> None:
+    images = ImageSet(tmp_path, shot.camera)
+    upright = cv2.rotate(shot.images[1], cv2.ROTATE_90_CLOCKWISE)
+    for k, image in enumerate((shot.images[0], upright, upright)):
+        images.add(Frame(k, image, f"{k}.png"))
+    images._find_cameras()
+    assert [photo.size for photo in images.photos[:2]] == [(400, 300)] * 2
+    assert images.photos[2].twin == 1
+    assert len(list((tmp_path / "images").iterdir())) == 3  # both, and one of them turned
 
 
 @pytest.mark.slow
