@@ -39,6 +39,7 @@ Progress = Callable[[str, int, int | None], None]
 logger = logging.getLogger(__name__)
 
 _LEAST_KEYPOINTS = 30
+_WIDE_PARALLAX = 0.3  # of a map that determines the principal point of an unknown lens
 
 
 class ImageSet:
@@ -51,7 +52,7 @@ class ImageSet:
     Args:
         folder: working copies, features and matches lie here; a second run with the same images goes on from them.
         camera: the lens of its format; None takes the focal length from the EXIF data or a guess, and refines it.
-            Focal lengths are refined by a common factor.
+            Focal lengths are refined by a common factor; where the parallax is large, also the principal point.
         depth: prior, or None.
         masks: what to ignore, or None.
         features: "sift"; the name of learned ones, see `tracks.learned.FEATURES`; or a folder with their networks.
@@ -74,6 +75,7 @@ class ImageSet:
         self.camera = camera
         self._lens_given = camera is not None
         options = options or Options()
+        self._lens_is_open = camera is None and options.lens == "auto"
         if camera is None:
             options = options.for_unknown_lens()
         self.options = _for_image_sets(options)
@@ -219,15 +221,18 @@ class ImageSet:
         colors: NDArray[np.uint8],
         progress: Progress,
     ) -> Reconstruction:
-        """The polished result of a map."""
+        """The polished result of a map; cameras that are far apart determine the principal point of a lens, too."""
+        options = self.options
+        if self._lens_is_open and part.parallax > _WIDE_PARALLAX:
+            options = replace(options, lens="all")
         with self._timed("polish"), OneThreadEach():
             polished = polish(
                 part.images,
                 part.points.all(),
                 np.array([part.focal]),
-                self.options,
+                options,
                 lambda stage: progress(stage, 0, None),
-                lens_shape(camera) if self.options.refine_focal_length else None,
+                lens_shape(camera) if options.refine_focal_length else None,
             )
         result = assemble(
             polished,
@@ -240,7 +245,7 @@ class ImageSet:
             prior_given=self._depth is not None,
             metric=self._depth is not None and self._depth.kind is DepthKind.METRIC,
             seconds={},
-            options=self.options.to_dict(),
+            options=options.to_dict(),
         )
         self._add_lenses(result, camera, polished.lens)
         self._add_twins(result)

@@ -103,6 +103,13 @@ class SetMapper:
         """Number of images with a pose."""
         return sum(image.registered for image in self.images)
 
+    @property
+    def parallax(self) -> float:
+        """Largest distance of a camera from the first one, over the median distance of the points from that."""
+        centers = np.array([-rotation.T @ translation for rotation, translation in (i.pose for i in self._order)])
+        distance = float(np.median(np.linalg.norm(self.points.all()[1] - centers[0], axis=1)))
+        return float(np.linalg.norm(centers - centers[0], axis=1).max()) / distance
+
     # --- the algorithm ------------------------------------------------------------------------------------------
 
     def run(self) -> None:

@@ -333,6 +333,21 @@ def test_images_of_two_cameras(tmp_path: Path) -> None:
         export(again, tmp_path / "out.chan", format="chan")
 
 
+def test_cameras_far_apart_determine_the_principal_point(tmp_path: Path) -> None:
+    images = []
+    for x in np.linspace(-1.2, 1.2, 6):
+        turn = pycolmap.Rotation3d(np.array([0.0, -np.arctan(x / 5.0), 0.0]))
+        (image,) = render_views([pycolmap.Rigid3d(turn, np.array([x, 0.1 * x**2, 0.0])).inverse()], 440, 330)
+        images.append(image[20:320, 30:430])  # the middle of the lens is at (190, 145)
+    result = reconstruct(images, depth=None, unordered=True)
+    assert result.parallax > 0.3
+    assert result.camera.mean_focal_length() == pytest.approx(room_camera(440, 330).focal_length_x, rel=0.02)
+    assert 0.0 < abs(result.camera.principal_point_x - 190) < 4  # the guess is off by 10
+    assert abs(result.camera.principal_point_y - 145) < 3
+    assert result.lens is not None
+    assert result.lens.cx_std is not None
+
+
 class Turned(PhotoFolder):
     """Takes note of what is turned, without files."""
 
