@@ -121,7 +121,8 @@ class Options:
     Attributes:
         preset: name from which the options were made.
         lens: what the polish estimates where the shot determines it: nothing, the focal length, also the radial
-            distortion, or also the principal point; "auto" is "fixed" for a given camera and "distortion" for none.
+            distortion, or also the principal point; "auto" is "fixed" for a given camera and "distortion" for none,
+            "all" in an image set with much parallax.
     """
 
     preset: str = "default"
