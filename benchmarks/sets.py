@@ -40,6 +40,7 @@ WIDE = ("fountain-P11", "herzjesu-P8")
 NARROW = ("kitchen-000", "kitchen-528", "kitchen-840")
 EVERY = 3  # frame of the narrow ones, which are videos
 WIDTH, HEIGHT = 1600, 1066
+ENOUGH = 40  # images to see how the cost of one grows
 
 Array = NDArray[np.float64]
 
@@ -187,7 +188,8 @@ def draw(found: dict[str, Any], command: str) -> None:
     """Write SETS.md and its figure."""
     text = ["# Image sets", "", f"`{command}`", ""]
     text += [
-        "Wall time and CPU time (all threads) from images to poses; ATE: root mean square after alignment. COLMAP: its "
+        "Wall time, which depends on what else the machine does, and CPU time of all threads, from images to "
+        "poses; ATE: root mean square after alignment. COLMAP: its "
         "incremental mapper with default options, SIFT on the CPU as here; a known lens is held fixed.", "",
         "| set | lens | method | images | ATE mm | AUC at 1° | wall s | CPU s | of COLMAP's CPU s |",
         "|---|---|---|---|---|---|---|---|---|",
@@ -198,7 +200,7 @@ def draw(found: dict[str, Any], command: str) -> None:
             ratio = f"{r['cpu'] / other['cpu']:.2f}" if other else ""
             text.append(
                 f"| {case.name} | {'known' if case.known else 'unknown'} | {case.method} "
-                f"| {r['registered']}/{r['images']} | {1000 * r['ate']:.2f} | {r['auc']:.1f} "
+                f"| {r['registered']}/{r['images']} | {_millimetres(r['ate'])} | {r['auc']:.1f} "
                 f"| {r['total']:.0f} | {r['cpu']:.0f} | {ratio} |"
             )
     traced = {key: r for key, r in found.items() if key.startswith("rendered")}
@@ -212,21 +214,31 @@ def draw(found: dict[str, Any], command: str) -> None:
             stages = ", ".join(f"{name} {value:.0f}" for name, value in r["seconds"].items())
             text.append(
                 f"| {r['images']} | {r['registered']} | {r['points']:,} | {r['ate'] / 2:.1e} | {r['total']:.0f} "
-                f"| {stages} | {r['cpu']:.0f} | {r['peak']:.0f} | n^{growth(r['trace'])[2]:.2f} |"
+                f"| {stages} | {r['cpu']:.0f} | {r['peak']:.0f} | {_cost(r)} |"
             )
-        text += ["", "![Cost of an image against the registered images](sets_cost.png)"]
-        _plot(traced)
+        if large := [r for r in traced.values() if r["images"] >= ENOUGH]:
+            text += ["", "![Cost of an image against the registered images](sets_cost.png)"]
+            _plot(large)
     (RESULTS / "SETS.md").write_text("\n".join(text) + "\n", encoding="utf-8")
 
 
-def _plot(traced: dict[str, Any]) -> None:
+def _millimetres(ate: float) -> str:
+    return f"{1000 * ate:.2f}" if np.isfinite(ate) else "–"
+
+
+def _cost(record: dict[str, Any]) -> str:
+    """How the cost of an image grows with the number of registered ones; few of them do not tell."""
+    return f"n^{growth(record['trace'])[2]:.2f}" if record["images"] >= ENOUGH else "–"
+
+
+def _plot(records: list[dict[str, Any]]) -> None:
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(figsize=(7, 4.2))
-    for r in sorted(traced.values(), key=lambda r: r["images"]):
+    for r in sorted(records, key=lambda r: r["images"]):
         images, seconds, exponent = growth(r["trace"])
         window = max(2, len(images) // 10)
         cost = (seconds[window:] - seconds[:-window]) / (images[window:] - images[:-window])

@@ -139,6 +139,7 @@ def test_another_network_is_refused(tmp_path: Path) -> None:
         LearnedFeatures(tmp_path)
 
 
+@pytest.mark.slow
 def test_the_real_networks_on_a_real_room(shared_data: Path, shared_models: Path) -> None:
     if not (shared_models / FEATURES["xfeat"].extractor).is_file():
         pytest.skip(f"{FEATURES['xfeat'].extractor} not found in {shared_models}")
