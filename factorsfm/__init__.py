@@ -6,6 +6,7 @@ import logging
 
 from factorsfm.api import reconstruct
 from factorsfm.camera import guess_camera, read_camera
+from factorsfm.control import Control, KnownDistance, KnownHeight, KnownPose, MarkedPoint, read_control
 from factorsfm.episode import Episode, ShotResult
 from factorsfm.errors import FactorsfmError, InputError, ModelError, ReconstructionError
 from factorsfm.explicit_graph import factor_graph
@@ -17,7 +18,16 @@ from factorsfm.live import Live, track
 from factorsfm.options import PRESETS, MapperOptions, Options, PolishOptions, TrackerOptions
 from factorsfm.priors.depth import DepthFolder, DepthKind, DepthMap, DepthModel, DepthPrior
 from factorsfm.priors.masks import MaskFolder, MaskModel, MaskPrior
-from factorsfm.reconstruction import CameraObservability, FrameResult, FrameStatus, PriorFit, Reconstruction, ShotKind
+from factorsfm.reconstruction import (
+    CameraObservability,
+    ControlFit,
+    ControlResidual,
+    FrameResult,
+    FrameStatus,
+    PriorFit,
+    Reconstruction,
+    ShotKind,
+)
 from factorsfm.shots import CutDetector, ShotUpdate, find_shots
 from factorsfm.sources import RawFormat, Source, open_source
 from factorsfm.stream import Stream
@@ -27,6 +37,9 @@ logging.getLogger(__name__).addHandler(logging.NullHandler())
 __all__ = [
     "PRESETS",
     "CameraObservability",
+    "Control",
+    "ControlFit",
+    "ControlResidual",
     "CutDetector",
     "DepthFolder",
     "DepthKind",
@@ -41,8 +54,12 @@ __all__ = [
     "FrameStatus",
     "FrameUpdate",
     "InputError",
+    "KnownDistance",
+    "KnownHeight",
+    "KnownPose",
     "Live",
     "MapperOptions",
+    "MarkedPoint",
     "MaskFolder",
     "MaskModel",
     "MaskPrior",
@@ -65,6 +82,7 @@ __all__ = [
     "guess_camera",
     "open_source",
     "read_camera",
+    "read_control",
     "read_frames",
     "read_result",
     "reconstruct",

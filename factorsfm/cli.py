@@ -86,6 +86,7 @@ def _reconstruct(arguments: argparse.Namespace, progress: _Progress) -> str:
             lens=arguments.lens,
             unordered=arguments.unordered or None,
             work=arguments.work,
+            control=arguments.control,
             progress=progress,
         )
     except ReconstructionError as error:
@@ -195,6 +196,12 @@ def _parser() -> argparse.ArgumentParser:
         "--unordered",
         action="store_true",
         help="match the images of a folder with each other, in any order; by itself where they are hardly a shot",
+    )
+    reconstruct.add_argument(
+        "--control",
+        type=Path,
+        metavar="FILE.json",
+        help="known poses, points, distances and heights: the result is in their world and unit",
     )
     reconstruct.add_argument(
         "--work",

@@ -17,7 +17,7 @@ import pytest
 from onnx import helper
 from test_models import save_network
 
-from factorsfm import PRESETS, DepthKind, FrameStatus, ShotKind, cli, read_camera, reconstruct
+from factorsfm import PRESETS, DepthKind, FrameStatus, ShotKind, cli, read_camera, read_control, reconstruct
 from factorsfm.export import FORMATS
 from factorsfm.priors import models
 from factorsfm.synthetic import render_shot, write_shot
@@ -64,6 +64,8 @@ def material(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for index, image in enumerate(shot.images):
         cv2.imwrite(str(folder / "images" / f"{index}.png"), image)
         cv2.imwrite(str(folder / "masks" / f"{index:06d}.png"), mask)
+    (control,) = (block.text for block in blocks("json") if "poses" in block.text)
+    (folder / "control.json").write_text(control)
     brightness = helper.make_node("ReduceMean", ["image"], ["mean"], axes=[1], keepdims=1)
     nodes = [brightness, helper.make_node("Softplus", ["mean"], ["out"])]
     network = save_network(folder / "network.onnx", [1, 3, 48, 80], nodes)
@@ -103,6 +105,8 @@ def test_command(block: Block, place: Path, monkeypatch: pytest.MonkeyPatch) -> 
             assert {path.name for path in output.iterdir()} == FILES
             summary = json.loads((output / "summary.json").read_text())
             assert summary["registered"] == summary["frames"] == FRAMES
+            assert ("--control" in words) == (summary["control"] is not None)
+            assert not any(item["contradicts"] for item in (summary["control"] or {"residuals": []})["residuals"])
         elif words[1] == "batch":
             assert {path.name for path in (output / "film" / "shot_001").iterdir()} == FILES
             index = json.loads((output / "index.json").read_text())
@@ -125,8 +129,11 @@ def test_python(block: Block, place: Path, capsys: pytest.CaptureFixture[str]) -
 
 
 @each("json")
-def test_camera_file(block: Block, tmp_path: Path) -> None:
+def test_file(block: Block, tmp_path: Path) -> None:
     (tmp_path / "camera.json").write_text(block.text)
+    if "poses" in block.text:
+        assert read_control(tmp_path / "camera.json").frames == ["0", "9", 0, 9]
+        return
     camera = read_camera(tmp_path / "camera.json")
     assert (camera.width, camera.height) == (320, 180)
     np.testing.assert_allclose(
