@@ -12,6 +12,7 @@ from factorsfm.errors import FactorsfmError, InputError, ModelError, Reconstruct
 from factorsfm.explicit_graph import factor_graph
 from factorsfm.export.options import ExportOptions, UpAxis
 from factorsfm.export.reading import read_result
+from factorsfm.extension import add_images
 from factorsfm.frame_update import FrameUpdate
 from factorsfm.frames import Frame, read_frames
 from factorsfm.live import Live, track
@@ -77,6 +78,7 @@ __all__ = [
     "Stream",
     "TrackerOptions",
     "UpAxis",
+    "add_images",
     "factor_graph",
     "find_shots",
     "guess_camera",

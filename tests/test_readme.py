@@ -25,7 +25,7 @@ from factorsfm.synthetic import render_shot, write_shot
 ROOT = Path(__file__).resolve().parents[1]
 TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
-COMMANDS = ("reconstruct", "stream", "batch", "export", "overlay", "demo")
+COMMANDS = ("reconstruct", "stream", "batch", "extend", "export", "overlay", "demo")
 FRAMES = 10
 FILES = {"trajectory.tum", "colmap", "points.ply", "summary.json", "report.html"}
 
@@ -57,13 +57,15 @@ def material(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("readme")
     shot = render_shot(frames=FRAMES, width=256, height=144)
     write_shot(shot, folder)
-    for name in ("images", "masks", "networks"):
+    for name in ("images", "masks", "networks", "stills"):
         (folder / name).mkdir()
     mask = np.zeros((90, 160), np.uint8)
     mask[60:, :30] = 255
     for index, image in enumerate(shot.images):
         cv2.imwrite(str(folder / "images" / f"{index}.png"), image)
         cv2.imwrite(str(folder / "masks" / f"{index:06d}.png"), mask)
+    for index, image in enumerate(render_shot("arc", frames=3, width=256, height=144, parallax=0.1).images[1:]):
+        cv2.imwrite(str(folder / "stills" / f"still_{index}.png"), image)
     (control,) = (block.text for block in blocks("json") if "poses" in block.text)
     (folder / "control.json").write_text(control)
     brightness = helper.make_node("ReduceMean", ["image"], ["mean"], axes=[1], keepdims=1)
@@ -107,6 +109,10 @@ def test_command(block: Block, place: Path, monkeypatch: pytest.MonkeyPatch) -> 
             assert summary["registered"] == summary["frames"] == FRAMES
             assert ("--control" in words) == (summary["control"] is not None)
             assert not any(item["contradicts"] for item in (summary["control"] or {"residuals": []})["residuals"])
+        elif words[1] == "extend":
+            assert {path.name for path in output.iterdir()} == FILES
+            summary = json.loads((output / "summary.json").read_text())
+            assert summary["registered"] == summary["frames"] == FRAMES + 2
         elif words[1] == "batch":
             assert {path.name for path in (output / "film" / "shot_001").iterdir()} == FILES
             index = json.loads((output / "index.json").read_text())
