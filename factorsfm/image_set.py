@@ -16,7 +16,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.camera import PIXEL_CENTER, guess_camera, lens_shape
+from factorsfm.camera import PIXEL_CENTER, guess_camera, lens_shape, normalized_from_pixels
+from factorsfm.control import Control, LocatedControl, locate
 from factorsfm.errors import InputError, ReconstructionError
 from factorsfm.frames import Frame, bgr_image
 from factorsfm.images import ImageTracks, MappedImage
@@ -76,6 +77,7 @@ class ImageSet:
         depth: prior, or None.
         masks: what to ignore, or None.
         options: see `Options`; None is the default preset.
+        control: what is known beforehand of poses and points; pixels are those of the images themselves.
     """
 
     def __init__(
@@ -86,9 +88,11 @@ class ImageSet:
         depth: DepthPrior | None = None,
         masks: MaskPrior | None = None,
         options: Options | None = None,
+        control: Control | None = None,
     ) -> None:
         self.camera = camera
         self._lens_given = camera is not None
+        self.control = control
         options = options or Options()
         if camera is None:
             options = options.for_unknown_lens()
@@ -151,11 +155,13 @@ class ImageSet:
         """Match, map and polish.
 
         Raises:
-            InputError: the camera is made for images of another format.
+            InputError: the camera is made for images of another format, or the control names an image that is not
+                there.
             ReconstructionError: fewer than two images can be used or registered.
         """
         report: Progress = progress or (lambda stage, done, total: None)
         camera = self._fit_together()
+        control = self._located_control()
         used = [k for k, photo in enumerate(self.photos) if not photo.left_out and photo.twin is None]
         if len(used) < 2:
             raise self._failure(f"{len(used)} of {len(self.photos)} images can be used, at least 2 needed", [])
@@ -177,14 +183,18 @@ class ImageSet:
                 mapper.images,
             )
         with self._timed("polish"), OneThreadEach():
-            polished = polish(
-                mapper.images,
-                mapper.points.all(),
-                np.array([mapper.focal]),
-                self.options,
-                lambda stage: report(stage, 0, None),
-                lens_shape(camera) if self.options.refine_focal_length else None,
-            )
+            try:
+                polished = polish(
+                    mapper.images,
+                    mapper.points.all(),
+                    np.array([mapper.focal]),
+                    self.options,
+                    lambda stage: report(stage, 0, None),
+                    lens_shape(camera) if self.options.refine_focal_length else None,
+                    control=control and _scaled(control, focal / mapper.focal),
+                )
+            except ReconstructionError as error:
+                raise self._failure(str(error), mapper.images) from error
         result = assemble(
             polished,
             mapper.images,
@@ -245,6 +255,19 @@ class ImageSet:
         photo.remark = "turned left by 90 degrees to the format of the others; its pose is that of the turned image"
         logger.warning("%s is %s", photo.name, photo.remark)
         photo.file, photo.size, photo.full_size = turned, photo.size[::-1], photo.full_size[::-1]
+
+    def _located_control(self) -> LocatedControl | None:
+        """The control, its marks normalised by the camera of the set."""
+
+        def normalized(position: int, xy: Array) -> Array:
+            photo = self.photos[position]
+            if photo.left_out or photo.file.endswith("-turned.png"):
+                raise InputError(f"control: points are marked in {photo.name}, {photo.left_out or photo.remark}")
+            assert self.camera is not None
+            factor = np.array([self.camera.width, self.camera.height]) / photo.full_size
+            return normalized_from_pixels(self.camera, (xy + PIXEL_CENTER) * factor - PIXEL_CENTER)
+
+        return None if self.control is None else locate(self.control, self.photos, normalized)
 
     # --- steps --------------------------------------------------------------------------------------------------
 
@@ -368,6 +391,11 @@ def _for_image_sets(options: Options) -> Options:
             options.polish, min_track_length=2, final_iterations=20, observation_sigmas=12.0, doubtful_px=0.6
         ),
     )
+
+
+def _scaled(control: LocatedControl, ratio: float) -> LocatedControl:
+    """What was marked with another focal length; `ratio`: the former one over the new one."""
+    return replace(control, marks=replace(control.marks, xy=control.marks.xy * ratio))
 
 
 def _bounded(

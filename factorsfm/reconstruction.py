@@ -97,6 +97,46 @@ class LensFit:
     cy_std: float | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class ControlResidual:
+    """How far one item of the control is from the result.
+
+    Attributes:
+        name: of the item; unit: of `error` and `sigma`: "m", "degrees" or "px".
+        error: length of the difference; sigma: as given; sigmas: the one over the other.
+        contradicts: whether the difference is so large that the item was given next to no weight.
+    """
+
+    name: str
+    unit: str
+    error: float
+    sigma: float
+    sigmas: float
+    contradicts: bool
+
+
+@dataclass(frozen=True, slots=True)
+class ControlFit:
+    """What the control did.
+
+    Attributes:
+        residuals: of every item that was used.
+        held: names of the frames whose poses were held exactly.
+        unused: what could not be used, and why.
+        placed: whether the result is in the world of the control; where only distances or heights are known, it is in
+            that of its first camera.
+        scale_std: relative standard deviation of the scene's size in the control's unit.
+        position_std: standard deviation of a camera's position in this world and unit, median over the cameras.
+    """
+
+    residuals: list[ControlResidual]
+    held: list[str]
+    unused: list[str]
+    placed: bool
+    scale_std: float
+    position_std: float
+
+
 @dataclass(slots=True)
 class FrameResult:
     """One frame of the source.
@@ -113,7 +153,8 @@ class FrameResult:
         prior: fitted scale and shift of the depth prior, None where the frame carries none.
         covariance: (6, 6) of (rotation vector, translation), a perturbation of `world_from_cam` on the right, relative
             to the first registered camera in the scene's unit of length, which is the mean inverse distance of the
-            points; None where not registered, or where no point of the result is seen.
+            points; with control absolute, in the control's world and unit; None where not registered, or where no
+            point of the result is seen.
         observability: what carries the pose, None where not registered.
         thumbnail: a small JPEG of the image, None where none is kept.
     """
@@ -160,7 +201,8 @@ class Reconstruction:
         point_std: (n,) standard deviation of the inverse distance of each point from the first registered camera,
             relative to it, in the unit of `FrameResult.covariance`; None where it is not known.
         lens: how far the shot determines the lens; None where it was given.
-        metric: whether the world unit is the metre (the prior is metric).
+        metric: whether the world unit is the metre (the prior is metric, or control says so).
+        control: what control did; None where there was none.
         notes: sentences that a user should read (translation unobservable, focal length guessed, ...).
         seconds: wall time by stage.
         options: resolved options as plain data.
@@ -181,6 +223,7 @@ class Reconstruction:
     point_std: NDArray[np.float64] | None = None
     lens: LensFit | None = None
     metric: bool = False
+    control: ControlFit | None = None
     notes: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
     options: dict[str, Any] = field(default_factory=dict)

@@ -10,6 +10,8 @@ import pycolmap
 from numpy.typing import NDArray
 
 from factorsfm.camera import with_focal, with_lens
+from factorsfm.controlled import control_notes
+from factorsfm.evaluation.alignment import Similarity
 from factorsfm.images import MappedImage
 from factorsfm.lens import LensEstimate
 from factorsfm.observability import observability_notes
@@ -66,6 +68,8 @@ def assemble(
             f"The focal length is {origin} ({pixels_long}): no camera was given, and the lens was to stay fixed."
         )
     scale = _metric_scale(polished, images) if metric else None
+    if polished.datum is not None:
+        scale = polished.datum.scale
     unit = scale or 1.0
     lens = polished.lens
     if lens is not None:
@@ -93,7 +97,7 @@ def assemble(
         at = np.searchsorted(key, (p.observations.point * (len(positions) + 1) + p.observations.frame)[order])
         predicted = p.residual + p.observations.inverse_depth - state.shift[p.observations.image]
         prior_residual[at] = (p.residual / np.maximum(np.abs(predicted), 1e-6))[order]
-    return Reconstruction(
+    result = Reconstruction(
         camera=camera,
         frames=frame_results,
         points=points,
@@ -109,10 +113,22 @@ def assemble(
         point_std=polished.point_std[kept] / state.inverse_distance[kept] if general else None,
         lens=_lens_fit(lens) if lens is not None else None,
         metric=scale is not None,
+        control=polished.control,
         notes=notes,
         seconds=seconds,
         options=options,
     )
+    if polished.datum is not None:
+        _place(result, polished.datum)
+    return result
+
+
+def _place(result: Reconstruction, datum: Similarity) -> None:
+    """Turn and move a result of the right size into the world of its control."""
+    world_from_first = pycolmap.Rigid3d(pycolmap.Rotation3d(datum.rotation), datum.translation)
+    for frame in result.registered:
+        frame.cam_from_world = frame.cam_from_world * world_from_first.inverse()
+    result.points = result.points @ datum.rotation.T + datum.translation
 
 
 def _usable_points(polished: Polished) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
@@ -213,6 +229,8 @@ def _notes(polished: Polished, has_depth: bool) -> list[str]:
         )
     if polished.lens is not None:
         notes.append(_lens_note(polished.lens))
+    if polished.control is not None:
+        notes += control_notes(polished.control)
     return notes
 
 

@@ -42,6 +42,7 @@ def summary(reconstruction: Reconstruction) -> dict[str, Any]:
         "parallax": reconstruction.parallax,
         "kind": reconstruction.kind,
         "metric": reconstruction.metric,
+        "control": reconstruction.control and asdict(reconstruction.control),
         "reprojection_error": median_reprojection_error(reconstruction),
         "observability": pooled_observability(reconstruction),
         "focal_length": reconstruction.camera.mean_focal_length(),

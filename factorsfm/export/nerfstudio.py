@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import shutil
 from pathlib import Path, PurePath
 from typing import Any
@@ -59,7 +60,15 @@ def write_nerfstudio(shot: Shot, folder: Path) -> None:
     if shot.footage is None:
         logger.warning("there is no footage: put the frames into images/ under the names of transforms.json")
     else:
-        _write_images(shot.footage, names, folder / "images")
+        (folder / "images").mkdir()
+        added = [(part["source"], part["first"]) for part in shot.reconstruction.options.get("added", [])]
+        sources = [(shot.footage, 0), *added]
+        for (source, first), last in zip(sources, [*(first for _, first in added), math.inf], strict=True):
+            here = {index - first: name for index, name in names.items() if first <= index < last}
+            if source is None:
+                logger.warning("there are no files of %s: put these images into images/", ", ".join(here.values()))
+            elif here:
+                _write_images(Path(source), here, folder / "images")
 
 
 def _lens(camera: pycolmap.Camera) -> dict[str, Any]:
@@ -82,7 +91,6 @@ def _lens(camera: pycolmap.Camera) -> dict[str, Any]:
 
 def _write_images(footage: Path, names: dict[int, str], folder: Path) -> None:
     """Image files are copied as they are, frames of a video are written without loss."""
-    folder.mkdir()
     missing = set(names)
     indices = sorted(names)
     for frame in read_frames(footage, slice(indices[0], indices[-1] + 1)):

@@ -13,7 +13,15 @@ from numpy.typing import NDArray
 
 from factorsfm.camera import PIXEL_CENTER
 from factorsfm.errors import InputError
-from factorsfm.reconstruction import FrameResult, FrameStatus, PriorFit, Reconstruction, ShotKind
+from factorsfm.reconstruction import (
+    ControlFit,
+    ControlResidual,
+    FrameResult,
+    FrameStatus,
+    PriorFit,
+    Reconstruction,
+    ShotKind,
+)
 from factorsfm.summary import PROGRAM
 
 
@@ -87,6 +95,7 @@ def _reconstruction(content: dict[str, Any], model: pycolmap.Reconstruction) -> 
         kind=ShotKind(content["kind"]),
         parallax=_number(content["parallax"]),
         metric=content["metric"],
+        control=_control(content["control"]),
         notes=content["notes"],
         seconds=content["seconds"],
         options=content["options"],
@@ -108,6 +117,14 @@ def _frame(status: dict[str, Any], images: dict[int, pycolmap.Image]) -> FrameRe
         reprojection_error=_number(status["reprojection_error"]),
         prior=prior and PriorFit(**{name: _number(value) for name, value in prior.items()}),
     )
+
+
+def _control(content: dict[str, Any] | None) -> ControlFit | None:
+    if content is None:
+        return None
+    residuals = [ControlResidual(**residual) for residual in content["residuals"]]
+    stds = _number(content["scale_std"]), _number(content["position_std"])
+    return ControlFit(residuals, content["held"], content["unused"], content["placed"], *stds)
 
 
 def _number(value: float | None) -> float:
