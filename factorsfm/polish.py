@@ -49,6 +49,7 @@ class Polished:
         point_std: (n,) standard deviations of the inverse distances, in the same unit.
         lens: what became of an unknown lens, None where it is known.
         datum, control: from this world to that of the control, and what the control did; None without control.
+        control_unused: whether there is control that could not take part.
     """
 
     frames: list[int]
@@ -65,6 +66,7 @@ class Polished:
     lens: LensEstimate | None = None
     datum: Similarity | None = None
     control: ControlFit | None = None
+    control_unused: bool = False
 
 
 def polish(
@@ -155,6 +157,7 @@ def polish(
         motion, pose_blocks(camera_covariance, k), observability,
         marginals.inverse_distance_std(camera_covariance), prior, lens,
     )  # fmt: skip
+    result.control_unused = control is not None and not free
     if control is not None and free:
         progress("polish: control")
         _put_under_control(result, adjustment, control)

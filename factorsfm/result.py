@@ -231,6 +231,8 @@ def _notes(polished: Polished, has_depth: bool) -> list[str]:
         notes.append(_lens_note(polished.lens))
     if polished.control is not None:
         notes += control_notes(polished.control)
+    if polished.control_unused:
+        notes.append("Control: not used, since a camera that stays in its place ties no lengths to the images.")
     return notes
 
 
