@@ -49,12 +49,16 @@ def factor_graph(reconstruction: Reconstruction) -> tuple[gtsam.NonlinearFactorG
 
     rows = np.flatnonzero(np.isin(r.observation_frame, list(poses)))
     frame_of, point_of = r.observation_frame[rows], r.observation_point[rows]
-    focal = r.camera.mean_focal_length()
     sigma = coordinate_sigma(r.observation_error[rows])
-    lens, pixel = gtsam.Cal3_S2(focal, focal, 0, 0, 0), noise.Robust.Create(kernel, noise.Isotropic.Sigma(2, sigma))
-    pixels = focal * normalized_from_pixels(r.camera, r.observation_xy[rows])
+    pixel = noise.Robust.Create(kernel, noise.Isotropic.Sigma(2, sigma))
+    lenses, pixels = {}, np.empty((len(rows), 2))
+    for i in poses:
+        mine, camera = frame_of == i, r.camera_of(r.frames[i])
+        focal = camera.mean_focal_length()
+        lenses[i] = gtsam.Cal3_S2(focal, focal, 0, 0, 0)
+        pixels[mine] = focal * normalized_from_pixels(camera, r.observation_xy[rows[mine]])
     for i, j, xy in zip(frame_of.tolist(), point_of.tolist(), pixels, strict=True):
-        graph.add(gtsam.GenericProjectionFactorCal3_S2(xy, pixel, X(i), L(j), lens))
+        graph.add(gtsam.GenericProjectionFactorCal3_S2(xy, pixel, X(i), L(j), lenses[i]))
 
     values.insert(T(0), virtual_offset())
     graph.add(gtsam.PriorFactorPose3(T(0), virtual_offset(), noise.Isotropic.Sigma(6, _HELD)))

@@ -69,6 +69,8 @@ def add_images(
     report: Progress = progress or (lambda stage, done, total: None)
     if base.kind is not ShotKind.GENERAL or len(base.registered) < 2:
         raise InputError("images can only be added to a result whose camera moves: only then are its points in place")
+    if base.has_own_lenses:
+        raise InputError("images can only be added to a result whose frames share one lens, and this one zooms")
     with work_folder(work) as folder, OneThreadEach():
         extension = _Extension(base, folder, refine)
         extension.take_known(source, report)

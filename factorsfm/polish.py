@@ -24,6 +24,7 @@ from factorsfm.reconstruction import CameraObservability, ControlFit, ShotKind
 from factorsfm.refinement import BundleAdjustment
 from factorsfm.registration import register_image
 from factorsfm.triangulation import triangulate
+from factorsfm.zoom import find_zoom
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -99,18 +100,24 @@ def polish(
         frames = sorted({*frames, *frames_under_control(registered, control, o.max_frames // 2)})
     used = [images[i] for i in frames]
     observations, tracks = _gather(used, min(o.min_track_length, max(2, len(used))))
-    group = np.zeros(len(images), np.int64) if groups is None else groups
-    state = _first_guess(used, observations, tracks, map_points, focal, group[frames])
+    groups = np.zeros(len(images), np.int64) if groups is None else groups
+    state = _first_guess(used, observations, tracks, map_points, focal, groups[frames])
 
     progress("polish: cameras")
     core, few, adjustment = _converge_cameras(state, observations, options)
     lens = None
     if options.refine_focal_length:
-        adjustment, lens = estimate_lens(adjustment, Lens(focal, np.zeros(4) if shape is None else shape), options)
-        few, observations = adjustment.observations, lens.renormalize(observations, state.group)
+        guess = Lens(focal, np.zeros(4) if shape is None else shape)
+        adjustment, lens = _estimate_lens(adjustment, guess, frames, options)
+        few, group = adjustment.observations, adjustment.state.group
+        observations = lens.renormalize(observations, group)
         if control is not None:
-            control = replace(control, marks=lens.renormalize(control.marks, group))
-        state = through(state, lens.lens.focal)
+            zooms = len(lens.lens.focal) > len(focal)
+            whole, of_image = (
+                (_between(lens, frames, np.arange(len(images))), np.arange(len(images))) if zooms else (lens, groups)
+            )
+            control = replace(control, marks=whole.renormalize(control.marks, of_image))
+        state = through(replace(state, log_focal=np.log(lens.guess.focal), group=group), lens.lens.focal)
     motion = classify_motion(adjustment, few, o)
     inflation = block_inflation(adjustment.reprojection_vectors(), few)
     weighed = None
@@ -163,7 +170,12 @@ def polish(
         _put_under_control(result, adjustment, control)
     if len(frames) < len(registered):
         progress("polish: frames between")
-        _add_frames_between(result, images, registered, group[registered], options)
+        group = groups[registered]
+        if lens is not None and len(lens.lens.focal) > len(focal):
+            group, lens = np.arange(len(registered)), _between(lens, frames, np.array(registered))
+            solved = np.searchsorted(registered, frames)
+            result.state, result.lens = replace(result.state, log_focal=np.log(lens.lens.focal), group=solved), lens
+        _add_frames_between(result, images, registered, group, options)
     return result
 
 
@@ -179,6 +191,23 @@ def _put_under_control(result: Polished, adjustment: BundleAdjustment, control: 
         first = 6 * k + len(result.state.log_focal)
         affine = np.sqrt(found.camera_covariance.diagonal()[first : first + 2 * len(result.prior.images)])
         result.prior.scale_std, result.prior.shift_std = affine[::2], affine[1::2]
+
+
+def _estimate_lens(
+    adjustment: BundleAdjustment, guess: Lens, frames: list[int], options: Options
+) -> tuple[BundleAdjustment, LensEstimate]:
+    """As `estimate_lens`, with a focal length for every frame where a zoom is asked for and found."""
+    zoom = None
+    if options.lens == "zoom" and len(guess.focal) == 1:
+        zoom = find_zoom(adjustment, guess, np.array(frames, np.float64), options.polish)
+    if zoom is None or not zoom.found:
+        adjustment, lens = estimate_lens(adjustment, guess, options)
+        return adjustment, replace(lens, zoom_std=zoom.std if zoom else None)
+    zoomed = Lens(np.exp(zoom.adjustment.state.log_focal), guess.shape)
+    prior = np.zeros(len(frames)), zoom.information
+    adjustment, lens = estimate_lens(zoom.adjustment, zoomed, options, prior)
+    seen = Lens(np.repeat(guess.focal, len(frames)), guess.shape)
+    return adjustment, replace(lens, guess=seen, zoom_std=zoom.std)
 
 
 # --- set-up -----------------------------------------------------------------------------------------------------
@@ -379,6 +408,16 @@ def _solved_frames(images: list[MappedImage], registered: list[int], limit: int)
     others = [i for i in registered if not images[i].keyframe]
     fill = [others[k] for k in np.linspace(0, len(others) - 1, limit - len(keyframes)).astype(int)]
     return sorted(keyframes + fill)
+
+
+def _between(lens: LensEstimate, frames: list[int], wanted: Index) -> LensEstimate:
+    """Of a zoom that is known at some images, the lens at others."""
+    return replace(
+        lens,
+        guess=Lens(np.repeat(lens.guess.focal[:1], len(wanted)), lens.guess.shape),
+        lens=Lens(np.exp(np.interp(wanted, frames, np.log(lens.lens.focal))), lens.lens.shape),
+        focal_std=np.interp(wanted, frames, lens.focal_std),
+    )
 
 
 def _add_frames_between(

@@ -84,9 +84,11 @@ class LensFit:
 
     Attributes:
         determined: whether the focal length is an estimate; otherwise it is the guess.
-        focal_std: standard deviation of the focal length, relative.
+        focal_std: standard deviation of the focal length, relative; of a zoom the largest one.
         k1_std, k2_std: of the radial distortion.
         cx_std, cy_std: of the principal point, in focal lengths.
+        zoom_std: of the ratio of the longest to the shortest focal length, relative, where a zoom was looked for. The
+            course of a zoom is an estimate even where the focal length as a whole is a guess.
     """
 
     determined: bool
@@ -95,6 +97,7 @@ class LensFit:
     k2_std: float | None = None
     cx_std: float | None = None
     cy_std: float | None = None
+    zoom_std: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,6 +160,8 @@ class FrameResult:
             point of the result is seen.
         observability: what carries the pose, None where not registered.
         thumbnail: a small JPEG of the image, None where none is kept.
+        camera: the lens of this frame where the frames do not share one, else None; see `Reconstruction.camera_of`.
+        focal_std: relative standard deviation of the focal length of this frame, where it is an estimate of its own.
     """
 
     index: int
@@ -173,6 +178,8 @@ class FrameResult:
     covariance: NDArray[np.float64] | None = None
     observability: CameraObservability | None = None
     thumbnail: bytes | None = None
+    camera: pycolmap.Camera | None = None
+    focal_std: float | None = None
 
     @property
     def registered(self) -> bool:
@@ -185,7 +192,8 @@ class Reconstruction:
     """Cameras, points and tracks of one shot.
 
     Attributes:
-        camera: the lens, shared by all frames (COLMAP convention: pixel centres at 0.5).
+        camera: the lens (COLMAP convention: pixel centres at 0.5); where frames have lenses of their own, with the
+            median of their focal lengths.
         frames: one entry per frame of the source, in order.
         points: (n, 3) world coordinates.
         colors: (n, 3) uint8 RGB.
@@ -232,6 +240,15 @@ class Reconstruction:
     def registered(self) -> list[FrameResult]:
         """The frames that have a pose."""
         return [frame for frame in self.frames if frame.registered]
+
+    def camera_of(self, frame: FrameResult) -> pycolmap.Camera:
+        """The lens with which a frame was taken."""
+        return frame.camera or self.camera
+
+    @property
+    def has_own_lenses(self) -> bool:
+        """Whether the focal length or more changes from frame to frame."""
+        return any(frame.camera is not None for frame in self.frames)
 
     def camera_centers(self) -> NDArray[np.float64]:
         """(k, 3) centres of the registered cameras, world coordinates."""

@@ -42,8 +42,8 @@ class BundleAdjustment:
         sigma: standard deviation of an observation (pixels).
         free_translation: False estimates rotations and bearings alone.
         free_focal: whether the focal lengths are estimated.
-        focal_information: (g, g) information matrix with which the logarithms of the focal lengths are known to be
-            zero, or, where it is singular, some combinations of them; None: nothing is known.
+        focal_prior: (g,) mean and (g, g) information matrix with which the logarithms of the focal lengths are known
+            beforehand; None: not at all.
         lens_sigmas: (4,) standard deviations with which `State.lens` is known beforehand (0: exactly); None: it is
             zero, the observations are undistorted.
         points_only: True holds everything but the points fixed.
@@ -62,7 +62,7 @@ class BundleAdjustment:
         sigma: float,
         free_translation: bool = True,
         free_focal: bool = False,
-        focal_information: Array | None = None,
+        focal_prior: tuple[Array, Array] | None = None,
         lens_sigmas: Array | None = None,
         points_only: bool = False,
         fixed: NDArray[np.bool_] | None = None,
@@ -79,7 +79,7 @@ class BundleAdjustment:
         self.control = control
         self.iterations = 0
         self._anchor = state.inverse_distance.copy()
-        self._focal_information = focal_information
+        self._focal_prior = focal_prior
         self._group = state.group[observations.frame]
         self._lens_sigmas = lens_sigmas
         self._lens_anchor = state.lens
@@ -177,8 +177,9 @@ class BundleAdjustment:
         cost += 0.5 * (((state.inverse_distance - self._anchor) / self._point_sigma) ** 2).sum()
         difference, information = self._lens_prior(state)
         cost += 0.5 * (information * difference**2).sum()
-        if self._focal_information is not None:
-            cost += 0.5 * state.log_focal @ self._focal_information @ state.log_focal
+        if self._focal_prior is not None:
+            away = state.log_focal - self._focal_prior[0]
+            cost += 0.5 * away @ self._focal_prior[1] @ away
         if (p := self.prior) is not None:
             cost += cauchy(self._prior(state)[0][:, None], self.options.kernel)[0].sum()
             cost += 0.5 * state.field @ p.field_information @ state.field
@@ -251,10 +252,10 @@ class BundleAdjustment:
         )  # fmt: skip
         point[:, 2, 2] += 1.0 / self._point_sigma**2
         point_gradient[:, 2] += (s.inverse_distance - self._anchor) / self._point_sigma**2
-        if self._focal_information is not None:
-            focal = slice(self._lens, self._shape)
-            camera[focal, focal] += self._focal_information
-            gradient[focal] += self._focal_information @ s.log_focal
+        if self._focal_prior is not None:
+            focal, (mean, information) = slice(self._lens, self._shape), self._focal_prior
+            camera[focal, focal] += information
+            gradient[focal] += information @ (s.log_focal - mean)
         if self._lens_sigmas is not None:
             shape = np.arange(self._shape, self._affine)
             difference, information = self._lens_prior(s)

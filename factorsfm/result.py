@@ -87,7 +87,7 @@ def assemble(
         xy[mine] = pixels[positions[k]][np.searchsorted(ids, polished.tracks[point[mine]])]
     points = state.bearing[kept] / state.inverse_distance[kept, None] * unit
     general = polished.motion.kind is ShotKind.GENERAL
-    frame_results = _frame_results(polished, images, frames, unit)
+    frame_results = _frame_results(polished, images, frames, camera, unit)
     notes += observability_notes(frame_results)
     prior_residual = np.full(len(observations.point), np.nan)
     if polished.prior is not None:
@@ -159,9 +159,9 @@ def _metric_scale(polished: Polished, images: list[MappedImage]) -> float | None
 
 
 def _frame_results(
-    polished: Polished, images: list[MappedImage], frames: Sequence[SeenFrame], unit: float
+    polished: Polished, images: list[MappedImage], frames: Sequence[SeenFrame], camera: pycolmap.Camera, unit: float
 ) -> list[FrameResult]:
-    state, o = polished.state, polished.observations
+    state, o, lens = polished.state, polished.observations, polished.lens
     threshold = _INLIER_SIGMAS * polished.sigma
     seen = np.bincount(o.frame, minlength=len(polished.frames))
     inliers = np.bincount(o.frame, polished.errors < threshold, len(polished.frames)).astype(int)
@@ -182,6 +182,10 @@ def _frame_results(
             result.inliers = int(inliers[row])
             result.reprojection_error = float(error[row])
             result.prior = prior.get(row)
+            if len(state.log_focal) > 1:
+                result.camera = with_focal(camera, float(state.focal[row]))
+                if lens is not None and lens.determined:
+                    result.focal_std = float(lens.focal_std[state.group[row]])
             if seen[row]:
                 covariance = polished.covariance[row].copy()
                 covariance[3:] *= unit
@@ -237,19 +241,28 @@ def _notes(polished: Polished, has_depth: bool) -> list[str]:
 
 
 def _lens_note(estimate: LensEstimate) -> str:
-    focal, std = float(np.median(estimate.lens.focal)), f"standard deviation {100 * estimate.focal_std.max():.1f} %"
+    focals, std = estimate.lens.focal, f"standard deviation {100 * estimate.focal_std.max():.1f} %"
+    focal, zoom = float(np.median(focals)), ""
+    if estimate.zoom_std is not None and len(focals) == 1:
+        zoom = f" No zoom was found: what it might be is less than {200 * estimate.zoom_std:.1f} %."
+    elif estimate.zoom_std is not None:
+        zoom = (
+            f" It changes from {focals[0]:.0f} to {focals[-1]:.0f} pixels; the ratio of the longest to the shortest is "
+            f"{focals.max() / focals.min():.3f} ± {estimate.zoom_std * focals.max() / focals.min():.3f}."
+        )
     if not estimate.determined:
         reason = f"this shot does not determine it ({std})"
         if estimate.misfit_px:
             reason = f"the tracks fit no lens (typical error {estimate.misfit_px:.2f} pixels)"
-        return f"The focal length is a guess ({focal:.0f} pixels): {reason}."
+        return f"The focal length is a guess ({focal:.0f} pixels): {reason}.{zoom}"
     note = f"The focal length was estimated: {focal:.0f} pixels, {std}"
     if np.isfinite(estimate.shape_std[0]):
         k, k_std = estimate.lens.shape, estimate.shape_std
         note += f"; radial distortion k1 {k[0]:.3f} ± {k_std[0]:.3f}, k2 {k[1]:.3f} ± {k_std[1]:.3f}"
-    return note + "."
+    return f"{note}.{zoom}"
 
 
 def _lens_fit(estimate: LensEstimate) -> LensFit:
-    shape = [float(std) if np.isfinite(std) else None for std in estimate.shape_std]
-    return LensFit(estimate.determined, float(estimate.focal_std.max()) if estimate.determined else None, *shape)
+    k1, k2, x, y = (float(std) if np.isfinite(std) else None for std in estimate.shape_std)
+    focal_std = float(estimate.focal_std.max()) if estimate.determined else None
+    return LensFit(estimate.determined, focal_std, k1, k2, x, y, estimate.zoom_std)

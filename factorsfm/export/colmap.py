@@ -11,7 +11,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.reconstruction import Reconstruction
+from factorsfm.reconstruction import FrameResult, Reconstruction
 
 _CAMERA_ID = 1
 
@@ -29,6 +29,7 @@ class _Observations(NamedTuple):
 def write_colmap(reconstruction: Reconstruction, folder: str | Path) -> None:
     """Write ``cameras.txt``, ``images.txt`` and ``points3D.txt``; the folder is made if absent.
 
+    One camera for all images, or where frames have lenses of their own one per image, of the same id.
     The image id is the frame index + 1, the point id the row in ``reconstruction.points`` + 1. Points seen
     from fewer than two registered frames are left out. Pixel centres lie at 0.5, as in all of COLMAP.
     The text format cannot hold a blank in an image name; where there is one, the binary files are
@@ -37,9 +38,12 @@ def write_colmap(reconstruction: Reconstruction, folder: str | Path) -> None:
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     observations = _observations(reconstruction)
-    camera = reconstruction.camera
-    lens = (_CAMERA_ID, camera.model_name, camera.width, camera.height, *map(_exact, camera.params))
-    _write_lines(folder / "cameras.txt", "CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", [_join(lens)])
+    cameras = {_camera_id(frame): reconstruction.camera_of(frame) for frame in reconstruction.registered}
+    lenses = [
+        _join((camera_id, camera.model_name, camera.width, camera.height, *map(_exact, camera.params)))
+        for camera_id, camera in sorted((cameras or {_CAMERA_ID: reconstruction.camera}).items())
+    ]
+    _write_lines(folder / "cameras.txt", "CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", lenses)
     _write_lines(
         folder / "images.txt",
         "IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; next line: POINTS2D[] as (X, Y, POINT3D_ID)",
@@ -96,7 +100,7 @@ def _image_lines(reconstruction: Reconstruction, observations: _Observations) ->
         if frame.cam_from_world is not None:
             qx, qy, qz, qw = frame.cam_from_world.rotation.quat
             pose = map(_exact, (qw, qx, qy, qz, *frame.cam_from_world.translation))
-            lines.append(_join((frame.index + 1, *pose, _CAMERA_ID, _image_name(frame.name))))
+            lines.append(_join((frame.index + 1, *pose, _camera_id(frame), _image_name(frame.name))))
             lines.append(_join(points2d[start:stop]))
     return lines
 
@@ -127,6 +131,10 @@ def _mean_errors(observations: _Observations, count: int) -> NDArray[np.float64]
     number = np.bincount(observations.point[known], minlength=count)
     total = np.bincount(observations.point[known], observations.error[known], minlength=count)
     return np.where(number > 0, total / np.maximum(number, 1), -1.0)
+
+
+def _camera_id(frame: FrameResult) -> int:
+    return _CAMERA_ID if frame.camera is None else frame.index + 1
 
 
 def _image_name(name: str) -> str:

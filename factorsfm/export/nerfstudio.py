@@ -16,6 +16,7 @@ from factorsfm.errors import InputError
 from factorsfm.export.ply import write_ply
 from factorsfm.export.shot import Shot
 from factorsfm.frames import read_frames
+from factorsfm.reconstruction import FrameResult
 from factorsfm.summary import json_text
 
 logger = logging.getLogger(__name__)
@@ -39,7 +40,7 @@ def write_nerfstudio(shot: Shot, folder: Path) -> None:
     """Write ``transforms.json``, ``points.ply`` and, where the footage is at hand, ``images/``.
 
     Camera axes x right, y up, looking along -z; the principal point counts from the image's corner; distortion is
-    included. Frames that are not registered are left out.
+    included. A frame with a lens of its own has its parameters beside it. Frames that are not registered are left out.
 
     Raises:
         InputError: nerfstudio does not know the lens model, or the footage lacks frames.
@@ -48,8 +49,10 @@ def write_nerfstudio(shot: Shot, folder: Path) -> None:
     content = {
         **_lens(shot.reconstruction.camera),
         "frames": [
-            {"file_path": f"images/{name}", "transform_matrix": matrix}
-            for name, matrix in zip(names.values(), shot.world_from_film, strict=True)
+            {"file_path": f"images/{name}", "transform_matrix": matrix, **_own_lens(frame)}
+            for name, matrix, frame in zip(
+                names.values(), shot.world_from_film, shot.reconstruction.registered, strict=True
+            )
         ],
         "ply_file_path": "points.ply",
         "applied_transform": np.column_stack([shot.world, np.zeros(3)]),
@@ -87,6 +90,15 @@ def _lens(camera: pycolmap.Camera) -> dict[str, Any]:
         **dict.fromkeys(("k1", "k2", "k3", "k4") if model == "OPENCV_FISHEYE" else ("k1", "k2", "p1", "p2"), 0.0),
         **dict(zip(names, values, strict=True)),
     }
+
+
+def _own_lens(frame: FrameResult) -> dict[str, Any]:
+    """What nerfstudio reads beside a frame; the camera model is that of the whole."""
+    if frame.camera is None:
+        return {}
+    own = _lens(frame.camera)
+    del own["camera_model"]
+    return own
 
 
 def _write_images(footage: Path, names: dict[int, str], folder: Path) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.camera import PIXEL_CENTER
+from factorsfm.camera import PIXEL_CENTER, camera_from_json
 from factorsfm.errors import InputError
 from factorsfm.reconstruction import (
     ControlFit,
@@ -61,11 +61,12 @@ def _summary(directory: Path) -> dict[str, Any]:
 
 def _reconstruction(content: dict[str, Any], model: pycolmap.Reconstruction) -> Reconstruction:
     images = {image_id - 1: image for image_id, image in model.images.items()}
-    frames = [_frame(status, images) for status in content["statuses"]]
+    own = len(model.cameras) > 1
+    frames = [_frame(status, images, own=own) for status in content["statuses"]]
     point_ids = sorted(model.points3D)
     row_of_point = {point_id: row for row, point_id in enumerate(point_ids)}
     points = [model.points3D[point_id] for point_id in point_ids]
-    (camera,) = model.cameras.values()
+    camera = camera_from_json(content["camera"]) if own else _copy(next(iter(model.cameras.values())))
 
     frame_of, point_of, xy, error = [], [], [np.empty((0, 2))], [np.empty(0)]
     for position, frame in enumerate(frames):
@@ -80,7 +81,7 @@ def _reconstruction(content: dict[str, Any], model: pycolmap.Reconstruction) -> 
         point_of += rows
         xy.append(pixels - PIXEL_CENTER)
         in_camera = frame.cam_from_world * np.array([points[row].xyz for row in rows])
-        error.append(np.linalg.norm(camera.img_from_cam(in_camera) - pixels, axis=1))
+        error.append(np.linalg.norm((frame.camera or camera).img_from_cam(in_camera) - pixels, axis=1))
     return Reconstruction(
         camera=camera,
         frames=frames,
@@ -102,7 +103,8 @@ def _reconstruction(content: dict[str, Any], model: pycolmap.Reconstruction) -> 
     )
 
 
-def _frame(status: dict[str, Any], images: dict[int, pycolmap.Image]) -> FrameResult:
+def _frame(status: dict[str, Any], images: dict[int, pycolmap.Image], *, own: bool) -> FrameResult:
+    """`own`: whether the frames have lenses of their own."""
     prior = status["prior"]
     return FrameResult(
         index=status["index"],
@@ -116,6 +118,8 @@ def _frame(status: dict[str, Any], images: dict[int, pycolmap.Image]) -> FrameRe
         inliers=status["inliers"],
         reprojection_error=_number(status["reprojection_error"]),
         prior=prior and PriorFit(**{name: _number(value) for name, value in prior.items()}),
+        camera=_copy(images[status["index"]].camera) if own and status["registered"] else None,
+        focal_std=status.get("focal_std"),
     )
 
 
@@ -133,3 +137,8 @@ def _number(value: float | None) -> float:
 
 def _joined(parts: list[NDArray[np.float64]]) -> NDArray[np.float64]:
     return np.concatenate(parts)
+
+
+def _copy(camera: pycolmap.Camera) -> pycolmap.Camera:
+    """A camera that outlives its model."""
+    return pycolmap.Camera(camera.todict())

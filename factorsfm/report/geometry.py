@@ -84,7 +84,8 @@ def tracks(reconstruction: Reconstruction, view: Scene, max_observations: int) -
         mine = position == k
         pose = reconstruction.frames[k].cam_from_world
         in_camera = pose * reconstruction.points[reconstruction.observation_point[kept[mine]]]
-        solved[mine] = reconstruction.camera.img_from_cam(in_camera) - PIXEL_CENTER
+        camera = reconstruction.camera_of(reconstruction.frames[k])
+        solved[mine] = camera.img_from_cam(in_camera) - PIXEL_CENTER
     return Tracks(position, point[kept], xy, solved - xy, reconstruction.prior_residual[kept])
 
 
