@@ -6,18 +6,29 @@ import logging
 
 from factorsfm.api import reconstruct
 from factorsfm.camera import guess_camera, read_camera
+from factorsfm.control import Control, KnownDistance, KnownHeight, KnownPose, MarkedPoint, read_control
 from factorsfm.episode import Episode, ShotResult
 from factorsfm.errors import FactorsfmError, InputError, ModelError, ReconstructionError
 from factorsfm.explicit_graph import factor_graph
 from factorsfm.export.options import ExportOptions, UpAxis
 from factorsfm.export.reading import read_result
+from factorsfm.extension import add_images
 from factorsfm.frame_update import FrameUpdate
 from factorsfm.frames import Frame, read_frames
 from factorsfm.live import Live, track
 from factorsfm.options import PRESETS, MapperOptions, Options, PolishOptions, TrackerOptions
 from factorsfm.priors.depth import DepthFolder, DepthKind, DepthMap, DepthModel, DepthPrior
 from factorsfm.priors.masks import MaskFolder, MaskModel, MaskPrior
-from factorsfm.reconstruction import CameraObservability, FrameResult, FrameStatus, PriorFit, Reconstruction, ShotKind
+from factorsfm.reconstruction import (
+    CameraObservability,
+    ControlFit,
+    ControlResidual,
+    FrameResult,
+    FrameStatus,
+    PriorFit,
+    Reconstruction,
+    ShotKind,
+)
 from factorsfm.shots import CutDetector, ShotUpdate, find_shots
 from factorsfm.sources import RawFormat, Source, open_source
 from factorsfm.stream import Stream
@@ -27,6 +38,9 @@ logging.getLogger(__name__).addHandler(logging.NullHandler())
 __all__ = [
     "PRESETS",
     "CameraObservability",
+    "Control",
+    "ControlFit",
+    "ControlResidual",
     "CutDetector",
     "DepthFolder",
     "DepthKind",
@@ -41,8 +55,12 @@ __all__ = [
     "FrameStatus",
     "FrameUpdate",
     "InputError",
+    "KnownDistance",
+    "KnownHeight",
+    "KnownPose",
     "Live",
     "MapperOptions",
+    "MarkedPoint",
     "MaskFolder",
     "MaskModel",
     "MaskPrior",
@@ -60,11 +78,13 @@ __all__ = [
     "Stream",
     "TrackerOptions",
     "UpAxis",
+    "add_images",
     "factor_graph",
     "find_shots",
     "guess_camera",
     "open_source",
     "read_camera",
+    "read_control",
     "read_frames",
     "read_result",
     "reconstruct",

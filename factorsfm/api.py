@@ -14,8 +14,9 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from factorsfm.control import Control, find_frames, read_control
 from factorsfm.errors import InputError
-from factorsfm.frames import Frame, read_frames
+from factorsfm.frames import Frame, list_images, read_frames
 from factorsfm.image_set import ImageSet
 from factorsfm.options import LensFreedom, Options
 from factorsfm.priors.depth import DepthFolder, DepthKind, DepthPrior, open_depth
@@ -40,6 +41,7 @@ def reconstruct(
     unordered: bool | None = None,
     features: str | Path = "sift",
     work: str | Path | None = None,
+    control: str | Path | Control | None = None,
     progress: Progress | None = None,
 ) -> Reconstruction:
     """Camera path, lens and sparse points of one shot, or of a set of photographs.
@@ -61,6 +63,8 @@ def reconstruct(
         features: of a set: "sift"; "xfeat", whose networks lie in the folder that ``FACTORSFM_MODELS`` names; or a
             folder that holds them.
         work: folder for the features and matches of a set, from which an interrupted run goes on; None keeps nothing.
+        control: what is known beforehand of poses, points, distances and heights, or its JSON file; the result is in
+            the world and unit of the control then.
         progress: called with the stage, the frames done, and their number where it is known.
 
     Raises:
@@ -73,12 +77,16 @@ def reconstruct(
     options = replace(Options.preset_named(preset), lens=lens)
     prior = open_depth(depth, depth_kind) if options.uses_depth else None
     mask_prior = open_masks(masks)
+    known = read_control(control) if isinstance(control, str | Path) else control
+    if known is not None and isinstance(source, str | Path) and Path(source).is_dir():
+        names = [(index, path.name) for index, path in enumerate(list_images(Path(source)))]
+        find_frames(known, names[frames or slice(None)])  # before the long work
     if unordered is None:
         unordered = isinstance(source, str | Path) and looks_unordered(Path(source), frames)
     if unordered:
-        result = _from_images(source, frames, camera, prior, mask_prior, options, features, work, progress)
+        result = _from_images(source, frames, camera, prior, mask_prior, options, known, features, work, progress)
     else:
-        result = _from_shot(source, frames, camera, prior, mask_prior, options, progress)
+        result = _from_shot(source, frames, camera, prior, mask_prior, options, known, progress)
     for part in (result, *result.others):
         part.seconds["total"] = time.perf_counter() - begin
         part.options["source"] = str(source) if isinstance(source, str | Path) else "frames"
@@ -94,9 +102,10 @@ def _from_shot(
     depth: DepthPrior | None,
     masks: MaskPrior | None,
     options: Options,
+    control: Control | None,
     progress: Progress | None,
 ) -> Reconstruction:
-    stream = Stream(camera, depth=depth, masks=masks, options=options)
+    stream = Stream(camera, depth=depth, masks=masks, options=options, control=control)
     for done, frame in enumerate(read_frames(source, frames)):
         if progress is not None:
             progress("frames", done, None)
@@ -114,12 +123,13 @@ def _from_images(
     depth: DepthPrior | None,
     masks: MaskPrior | None,
     options: Options,
+    control: Control | None,
     features: str | Path,
     work: str | Path | None,
     progress: Progress | None,
 ) -> Reconstruction:
-    with _work_folder(work) as folder:
-        images = ImageSet(folder, camera, depth=depth, masks=masks, features=features, options=options)
+    with work_folder(work) as folder:
+        images = ImageSet(folder, camera, depth=depth, masks=masks, features=features, options=options, control=control)
         if isinstance(source, str | Path) and (others := other_files(Path(source))):
             images.note(f"{len(others)} files that are no images were ignored: {', '.join(others[:5])}.")
         for done, image in enumerate(read_images(source, frames)):
@@ -135,7 +145,8 @@ def _from_images(
 
 
 @contextmanager
-def _work_folder(work: str | Path | None) -> Iterator[Path]:
+def work_folder(work: str | Path | None) -> Iterator[Path]:
+    """The folder, or a temporary one where there is none."""
     if work is not None:
         yield Path(work)
         return

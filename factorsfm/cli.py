@@ -12,7 +12,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, NoReturn, TextIO, get_args
 
-from factorsfm import api, demo, stream_command
+from factorsfm import api, demo, extension, stream_command
 from factorsfm.batch import command as batch_command
 from factorsfm.camera import read_camera
 from factorsfm.errors import FactorsfmError, ReconstructionError
@@ -57,6 +57,8 @@ def _run(arguments: argparse.Namespace, progress: _Progress) -> str:
     match arguments.command:
         case "demo":
             return _demo(arguments, progress)
+        case "extend":
+            return _extend(arguments, progress)
         case "export":
             return export_command.run(arguments)
         case "stream":
@@ -87,6 +89,7 @@ def _reconstruct(arguments: argparse.Namespace, progress: _Progress) -> str:
             unordered=arguments.unordered or None,
             features=arguments.features,
             work=arguments.work,
+            control=arguments.control,
             progress=progress,
         )
     except ReconstructionError as error:
@@ -94,6 +97,22 @@ def _reconstruct(arguments: argparse.Namespace, progress: _Progress) -> str:
         seconds = {"total": time.perf_counter() - start}
         write_failure(arguments.output, str(error), error.frames, given, seconds)
         raise
+    progress("writing", 0, None)
+    write_folder(reconstruction, arguments.output)
+    return conclusion(reconstruction, arguments.output)
+
+
+def _extend(arguments: argparse.Namespace, progress: _Progress) -> str:
+    check_directory(arguments.output)
+    reconstruction = extension.add_images(
+        arguments.result,
+        arguments.images,
+        source=arguments.source,
+        frames=parse_range(arguments.frames) if arguments.frames else None,
+        refine=arguments.refine,
+        work=arguments.work,
+        progress=progress,
+    )
     progress("writing", 0, None)
     write_folder(reconstruction, arguments.output)
     return conclusion(reconstruction, arguments.output)
@@ -205,6 +224,12 @@ def _parser() -> argparse.ArgumentParser:
         "(default: %(default)s)",
     )
     reconstruct.add_argument(
+        "--control",
+        type=Path,
+        metavar="FILE.json",
+        help="known poses, points, distances and heights: the result is in their world and unit",
+    )
+    reconstruct.add_argument(
         "--work",
         type=Path,
         metavar="DIR",
@@ -232,6 +257,24 @@ def _parser() -> argparse.ArgumentParser:
     batch.add_argument("source", metavar="SOURCE", help="a video file, or a folder of video files")
     _add_shot_arguments(batch, output="folder of the results: new, empty, or that of an earlier run, which goes on")
     batch_command.add_arguments(batch)
+
+    extend = commands.add_parser(
+        "extend",
+        parents=[common],
+        help="add images to a result, in its coordinates",
+        description="Register further images of the same lens on a result, whose cameras stay where they are.",
+    )
+    extend.add_argument("result", type=Path, metavar="RESULT", help="folder that factorsfm reconstruct has written")
+    extend.add_argument("images", metavar="IMAGES", help="the images to add: a folder, or a video file")
+    extend.add_argument("--output", type=Path, required=True, metavar="DIR", help=_RESULT)
+    extend.add_argument(
+        "--source", type=Path, metavar="VIDEO|FOLDER", help="the images of the result (default: where they were)"
+    )
+    extend.add_argument("--refine", action="store_true", help="adjust the known cameras, too")
+    _add_range(extend)
+    extend.add_argument(
+        "--work", type=Path, metavar="DIR", help="keep features and matches here: an interrupted run goes on from them"
+    )
 
     demo_command = commands.add_parser(
         "demo",
@@ -295,7 +338,8 @@ def _add_shot_arguments(parser: argparse.ArgumentParser, output: str = _RESULT) 
         choices=get_args(LensFreedom),
         default="auto",
         help="what of the lens is estimated where the shot determines it: nothing, the focal length, also the radial "
-        "distortion, or also the principal point; auto: fixed with --camera, distortion without",
+        "distortion, or also the principal point; zoom: distortion, and a focal length for every frame; auto: fixed "
+        "with --camera, distortion without",
     )
     parser.add_argument("--preset", choices=list(PRESETS), default="default", help="default: %(default)s")
 

@@ -51,9 +51,9 @@ def factor_graph(reconstruction: Reconstruction) -> tuple[gtsam.NonlinearFactorG
     frame_of, point_of = r.observation_frame[rows], r.observation_point[rows]
     sigma = coordinate_sigma(r.observation_error[rows])
     pixel = noise.Robust.Create(kernel, noise.Isotropic.Sigma(2, sigma))
-    pixels, lenses = np.empty((len(rows), 2)), {}
+    lenses, pixels = {}, np.empty((len(rows), 2))
     for i in poses:
-        camera, mine = r.camera_of(r.frames[i]), frame_of == i
+        mine, camera = frame_of == i, r.camera_of(r.frames[i])
         focal = camera.mean_focal_length()
         lenses[i] = gtsam.Cal3_S2(focal, focal, 0, 0, 0)
         pixels[mine] = focal * normalized_from_pixels(camera, r.observation_xy[rows[mine]])

@@ -14,8 +14,16 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.camera import PIXEL_CENTER, guess_camera, lens_shape, with_focal, with_lens
-from factorsfm.errors import ReconstructionError
+from factorsfm.camera import (
+    PIXEL_CENTER,
+    guess_camera,
+    lens_shape,
+    normalized_from_pixels,
+    with_focal,
+    with_lens,
+)
+from factorsfm.control import Control, LocatedControl, locate
+from factorsfm.errors import InputError, ReconstructionError
 from factorsfm.frames import Frame, bgr_image
 from factorsfm.images import ImageTracks, MappedImage
 from factorsfm.lens import LensEstimate
@@ -57,6 +65,8 @@ class ImageSet:
         masks: what to ignore, or None.
         features: "sift"; the name of learned ones, see `tracks.learned.FEATURES`; or a folder with their networks.
         options: see `Options`; None is the default preset.
+        control: what is known beforehand of poses and points, for the largest part of a set that falls apart; pixels
+            are those of the images themselves.
 
     Raises:
         ModelError: the networks of the features are not there.
@@ -71,9 +81,11 @@ class ImageSet:
         masks: MaskPrior | None = None,
         features: str | Path = "sift",
         options: Options | None = None,
+        control: Control | None = None,
     ) -> None:
         self.camera = camera
         self._lens_given = camera is not None
+        self.control = control
         options = options or Options()
         self._lens_is_open = camera is None and options.lens == "auto"
         if camera is None:
@@ -120,11 +132,13 @@ class ImageSet:
         """Match, map and polish.
 
         Raises:
-            InputError: the camera is made for images of another format than any of these.
+            InputError: the camera is made for images of another format than any of these, or the control names an
+                image that is not there.
             ReconstructionError: fewer than two images can be used or registered.
         """
         report: Progress = progress or (lambda stage, done, total: None)
         camera = self._find_cameras()
+        control = self._located_control()
         used = [k for k, photo in enumerate(self.photos) if not photo.left_out and photo.twin is None]
         if len(used) < 2:
             raise self._failure(f"{len(used)} of {len(self.photos)} images can be used, at least 2 needed", [])
@@ -144,11 +158,11 @@ class ImageSet:
                 f"{self.photos[worst].name}: {images[worst].message}",
                 images,
             )
-        result, *others = [self._solve(part, camera, pixels, colors, report) for part in parts]
-        for number, part in enumerate((result, *others), 1):
+        result = self._solve(parts[0], camera, pixels, colors, report, control)
+        result.others = [self._solve(part, camera, pixels, colors, report, None) for part in parts[1:]]
+        for number, part in enumerate((result, *result.others), 1):
             part.notes += self._summary(part, number, parts)
             part.seconds = dict(self.seconds)
-        result.others = others
         return result
 
     # --- cameras ------------------------------------------------------------------------------------------------
@@ -166,6 +180,19 @@ class ImageSet:
                 photo.camera = self.photos[photo.twin].camera
         sizes = Counter(photo.size for photo in photos if photo.camera == 0)
         return _resized(self._cameras[0], sizes.most_common(1)[0][0])
+
+    def _located_control(self) -> LocatedControl | None:
+        """The control, its marks normalised by the cameras of their images."""
+
+        def normalized(position: int, xy: Array) -> Array:
+            photo = self.photos[position]
+            if photo.left_out or photo.file.endswith("-turned.png"):
+                raise InputError(f"control: points are marked in {photo.name}, {photo.left_out or photo.remark}")
+            own = self._cameras[photo.camera]
+            factor = np.array([own.width, own.height]) / photo.full_size
+            return normalized_from_pixels(own, (xy + PIXEL_CENTER) * factor - PIXEL_CENTER)
+
+        return None if self.control is None else locate(self.control, self.photos, normalized)
 
     # --- steps --------------------------------------------------------------------------------------------------
 
@@ -220,20 +247,25 @@ class ImageSet:
         pixels: list[Array],
         colors: NDArray[np.uint8],
         progress: Progress,
+        control: LocatedControl | None,
     ) -> Reconstruction:
         """The polished result of a map; cameras that are far apart determine the principal point of a lens, too."""
         options = self.options
         if self._lens_is_open and part.parallax > _WIDE_PARALLAX:
             options = replace(options, lens="all")
         with self._timed("polish"), OneThreadEach():
-            polished = polish(
-                part.images,
-                part.points.all(),
-                np.array([part.focal]),
-                options,
-                lambda stage: progress(stage, 0, None),
-                lens_shape(camera) if options.refine_focal_length else None,
-            )
+            try:
+                polished = polish(
+                    part.images,
+                    part.points.all(),
+                    np.array([part.focal]),
+                    options,
+                    lambda stage: progress(stage, 0, None),
+                    lens_shape(camera) if options.refine_focal_length else None,
+                    control=control and _scaled(control, camera.mean_focal_length() / part.focal),
+                )
+            except ReconstructionError as error:
+                raise self._failure(str(error), part.images) from error
         result = assemble(
             polished,
             part.images,
@@ -353,6 +385,11 @@ def _for_image_sets(options: Options) -> Options:
             options.polish, min_track_length=2, final_iterations=20, observation_sigmas=12.0, doubtful_px=0.6
         ),
     )
+
+
+def _scaled(control: LocatedControl, ratio: float) -> LocatedControl:
+    """What was marked with another focal length; `ratio`: the former one over the new one."""
+    return replace(control, marks=replace(control.marks, xy=control.marks.xy * ratio))
 
 
 def _resized(camera: pycolmap.Camera, size: tuple[int, int]) -> pycolmap.Camera:

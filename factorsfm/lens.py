@@ -55,6 +55,8 @@ class LensEstimate:
         misfit_px: standard deviation of the tracks where they fit no lens: what an estimate says is chance then;
             0 where they do.
         determined: whether the focal lengths are estimates, not the guess.
+        zoom_std: relative standard deviation of the ratio of the longest to the shortest focal length where a zoom was
+            looked for, whether one was found or not; None: none was. The course of a zoom is an estimate in any case.
     """
 
     guess: Lens
@@ -63,6 +65,7 @@ class LensEstimate:
     shape_std: Array
     misfit_px: float
     determined: bool
+    zoom_std: float | None = None
 
     def renormalize(self, observations: Observations, group: Index) -> Observations:
         """What was undistorted by the guess, undistorted by the lens; `group` as in `State`."""
@@ -99,11 +102,13 @@ def through(state: State, focal: Array) -> State:
     )
 
 
-def estimate_lens(adjustment: BundleAdjustment, guess: Lens, options: Options) -> tuple[BundleAdjustment, LensEstimate]:
+def estimate_lens(
+    adjustment: BundleAdjustment, guess: Lens, options: Options, focal_prior: tuple[Array, Array] | None = None
+) -> tuple[BundleAdjustment, LensEstimate]:
     """The lens where the shot determines it, else the guess; and the cameras with it.
 
     Args:
-        adjustment: converged with the guess.
+        adjustment: converged with the guess; focal_prior: as in `BundleAdjustment`.
 
     Returns:
         The adjustment with undistorted observations, whose `observations` are those of the lens.
@@ -114,19 +119,23 @@ def estimate_lens(adjustment: BundleAdjustment, guess: Lens, options: Options) -
         "focal": np.zeros(4),
         "distortion": np.array([_DISTORTION_SIGMA, _DISTORTION_SIGMA, 0.0, 0.0]),
         "all": np.array([_DISTORTION_SIGMA, _DISTORTION_SIGMA, _CENTER_SIGMA * width, _CENTER_SIGMA * width]),
-    }[options.lens]
+    }["distortion" if options.lens == "zoom" else options.lens]
     group = adjustment.state.group
     focal = search_focal(adjustment, guess, o)
     start = replace(through(adjustment.state, focal), lens=guess.shape)
     observations = renormalized(adjustment.observations, guess, Lens(focal, guess.shape), group)
-    best = _solved(start, observations, o, adjustment.sigma, np.zeros(4))
+    best = solved_with_lens(start, observations, o, adjustment.sigma, np.zeros(4), focal_prior=focal_prior)
     motion = classify_motion(best, best.observations, options.polish)
     moves = motion.kind is ShotKind.GENERAL
     if not moves:  # a translation that is none would bend with the lens
-        best = _solved(motion.rotation_only, best.observations, o, best.sigma, np.zeros(4), moves=False)
+        best = solved_with_lens(
+            motion.rotation_only, best.observations, o, best.sigma, np.zeros(4), moves=False, focal_prior=focal_prior
+        )
     std, _ = _standard_deviations(best)
     if sigmas.any():
-        full = _solved(best.state, best.observations, o, best.sigma, sigmas, moves=moves)
+        full = solved_with_lens(
+            best.state, best.observations, o, best.sigma, sigmas, moves=moves, focal_prior=focal_prior
+        )
         full_std, evidence = _standard_deviations(full, guess.shape)
         displacement = _displacement(full, guess.shape)
         logger.info(
@@ -205,8 +214,15 @@ def _some_frames(state: State, observations: Observations) -> tuple[State, Obser
     )  # fmt: skip
 
 
-def _solved(
-    state: State, observations: Observations, options: PolishOptions, sigma: float, sigmas: Array, *, moves: bool = True
+def solved_with_lens(
+    state: State,
+    observations: Observations,
+    options: PolishOptions,
+    sigma: float,
+    sigmas: Array,
+    *,
+    moves: bool = True,
+    focal_prior: tuple[Array, Array] | None = None,
 ) -> BundleAdjustment:
     """Converged over the lens too, first at the noise that is thought, then at that of the residuals.
 
@@ -215,29 +231,26 @@ def _solved(
     known = None if not state.lens.any() and not sigmas.any() else sigmas
     for _ in range(2):
         problem = BundleAdjustment(
-            state, observations, options, sigma=sigma, free_focal=True, free_translation=moves, lens_sigmas=known
-        )
+            state, observations, options, sigma=sigma, free_translation=moves, free_focal=True,
+            focal_prior=focal_prior, lens_sigmas=known,
+        )  # fmt: skip
         problem.solve()
         before, after = (Lens(np.exp(s.log_focal), s.lens) for s in (state, problem.state))
         state, observations = problem.state, renormalized(observations, before, after, state.group)
         sigma = coordinate_sigma(problem.reprojection_errors())
     return BundleAdjustment(
-        state, observations, options, sigma=sigma, free_focal=True, free_translation=moves, lens_sigmas=known
-    )
+        state, observations, options, sigma=sigma, free_translation=moves, free_focal=True,
+        focal_prior=focal_prior, lens_sigmas=known,
+    )  # fmt: skip
 
 
 def _standard_deviations(adjustment: BundleAdjustment, guess: Array | None = None) -> tuple[Array, float]:
     """(g + 4,) of log focal lengths and shape, NaN where held; and the evidence that the shape is not the guess.
 
-    Errors that are alike for a while, or in a part of the image, count as one. Of two ways to see how many there are,
-    blocks of residuals and the pull of the tracks in each part of the image, the more doubtful one counts.
+    Of the two covariances the more doubtful one counts.
     """
-    first, groups = 6 * len(adjustment.state.rotation), len(adjustment.state.log_focal)
-    columns = first + adjustment.free_lens
-    whole, _ = adjustment.covariance(np.zeros(0, np.int64))
-    inflation = block_inflation(adjustment.reprojection_vectors(), adjustment.observations)
-    formal = whole[np.ix_(columns, columns)] * inflation
-    pulled = _pulled_covariance(adjustment, columns)
+    groups = len(adjustment.state.log_focal)
+    formal, pulled = lens_covariances(adjustment)
     std = np.full(groups + 4, np.nan)
     std[adjustment.free_lens] = np.sqrt(np.maximum(formal.diagonal(), pulled.diagonal()))
     evidence = 0.0
@@ -245,6 +258,18 @@ def _standard_deviations(adjustment: BundleAdjustment, guess: Array | None = Non
         away = (adjustment.state.lens - guess)[adjustment.free_lens[groups:] - groups]
         evidence = min(float(away @ np.linalg.solve(c[groups:, groups:], away)) for c in (formal, pulled))
     return std, evidence
+
+
+def lens_covariances(adjustment: BundleAdjustment) -> tuple[Array, Array]:
+    """Covariance of the free ones of log focal lengths and shape, seen in two ways.
+
+    Errors that are alike for a while, or in a part of the image, count as one. How many there are is seen in blocks of
+    residuals, and in the pull of the tracks in each part of the image.
+    """
+    columns = 6 * len(adjustment.state.rotation) + adjustment.free_lens
+    whole, _ = adjustment.covariance(np.zeros(0, np.int64))
+    inflation = block_inflation(adjustment.reprojection_vectors(), adjustment.observations)
+    return whole[np.ix_(columns, columns)] * inflation, _pulled_covariance(adjustment, columns)
 
 
 def _pulled_covariance(adjustment: BundleAdjustment, columns: Index) -> Array:

@@ -70,7 +70,7 @@ def in_scene_unit(marginals: Marginals, state: State) -> Array:
     field = affine + 2 * images
     motion[:lens, 0].reshape(-1, 6)[:, 3:] = state.translation
     motion[affine:field:2, 0] = -state.scale
-    motion[field:, 0] = state.field
+    motion[field : field + len(state.field), 0] = state.field
     measured = np.zeros((len(state.bearing), 3, 1))
     measured[:, 2] = 1.0 / state.inverse_distance.sum()
     return marginals.relative(motion, measured)

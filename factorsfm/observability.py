@@ -20,7 +20,7 @@ _STATIC_SHARE = 0.004  # largest median displacement of the tracks of a static s
 # Noise costs one unit per observation (two coordinates, half a unit each). Translation and depths fit some of it; they
 # count as observed when they explain at least half as much again as noise. On tripod shots the gain is 0.05 to 0.15,
 # on the first ten frames of slow moves 1.5 and more.
-_LEAST_GAIN = 0.5
+LEAST_GAIN = 0.5
 # Worth a sentence: the prior gives at least half of the information, or a virtual object may visibly drift.
 _NOTED_SHARE = 0.5
 _NOTED_SLIDE_PX = 0.5
@@ -77,14 +77,20 @@ def classify_motion(adjustment: BundleAdjustment, observations: Observations, op
         free_translation=False,
     )
     rotation_only.solve()
-    difference = rotation_only.observation_costs() - adjustment.observation_costs()
-    # Median over the tracks: what moves by itself must not move the camera.
-    gain = float(np.median(np.add.reduceat(difference, start) / np.diff(np.append(start, len(difference)))))
+    gain = translation_gain(rotation_only, adjustment)
     moved = displacement(observations)
     kind = ShotKind.ROTATION if moved > _STATIC_SHARE else ShotKind.STATIC
-    if gain > _LEAST_GAIN:
+    if gain > LEAST_GAIN:
         kind = ShotKind.GENERAL
     return Motion(kind, moved * float(np.median(state.focal)), gain, rotation_only.state)
+
+
+def translation_gain(rotation_only: BundleAdjustment, adjustment: BundleAdjustment) -> float:
+    """Decrease of the cost by translation and depth, per observation of the median track, of the same observations."""
+    difference = rotation_only.observation_costs() - adjustment.observation_costs()
+    start = np.searchsorted(adjustment.observations.point, np.arange(len(adjustment.state.bearing)))
+    # Median over the tracks: what moves by itself must not move the camera.
+    return float(np.median(np.add.reduceat(difference, start) / np.diff(np.append(start, len(difference)))))
 
 
 # --- what carries each camera -----------------------------------------------------------------------------------

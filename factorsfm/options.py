@@ -10,7 +10,7 @@ from factorsfm.errors import InputError
 
 FOCAL_STD = 0.015  # relative standard deviation up to which a focal length counts as determined
 
-LensFreedom = Literal["auto", "fixed", "focal", "distortion", "all"]
+LensFreedom = Literal["auto", "fixed", "focal", "distortion", "all", "zoom"]
 DepthUse = Literal["none", "paper", "inverse"]
 
 
@@ -121,8 +121,9 @@ class Options:
     Attributes:
         preset: name from which the options were made.
         lens: what the polish estimates where the shot determines it: nothing, the focal length, also the radial
-            distortion, or also the principal point; "auto" is "fixed" for a given camera and "distortion" for none,
-            "all" in an image set with much parallax.
+            distortion, or also the principal point; "zoom" is "distortion" with a focal length for every frame, where
+            the shot shows that it changes; "auto" is "fixed" for a given camera and "distortion" for none, "all" in an
+            image set with much parallax.
     """
 
     preset: str = "default"

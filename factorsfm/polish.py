@@ -9,6 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.control import LocatedControl
+from factorsfm.controlled import controlled, frames_under_control
+from factorsfm.evaluation.alignment import Similarity
 from factorsfm.images import MappedImage, gather
 from factorsfm.lens import Lens, LensEstimate, estimate_lens, through
 from factorsfm.marginals import in_scene_unit
@@ -17,10 +20,11 @@ from factorsfm.observability import Motion, camera_observability, classify_motio
 from factorsfm.options import Options, PolishOptions
 from factorsfm.prior_term import PriorPart, joint_problem, weigh_prior
 from factorsfm.problem import Observations, State
-from factorsfm.reconstruction import CameraObservability, ShotKind
+from factorsfm.reconstruction import CameraObservability, ControlFit, ShotKind
 from factorsfm.refinement import BundleAdjustment
 from factorsfm.registration import register_image
 from factorsfm.triangulation import triangulate
+from factorsfm.zoom import find_zoom
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -45,6 +49,8 @@ class Polished:
         observability: what carries each of them.
         point_std: (n,) standard deviations of the inverse distances, in the same unit.
         lens: what became of an unknown lens, None where it is known.
+        datum, control: from this world to that of the control, and what the control did; None without control.
+        control_unused: whether there is control that could not take part.
     """
 
     frames: list[int]
@@ -59,6 +65,9 @@ class Polished:
     point_std: Array
     prior: PriorPart | None = None
     lens: LensEstimate | None = None
+    datum: Similarity | None = None
+    control: ControlFit | None = None
+    control_unused: bool = False
 
 
 def polish(
@@ -69,6 +78,7 @@ def polish(
     progress: Callable[[str], None] = lambda stage: None,
     shape: Array | None = None,
     groups: Index | None = None,
+    control: LocatedControl | None = None,
 ) -> Polished:
     """Triangulate all tracks and minimise over all registered frames.
 
@@ -77,22 +87,37 @@ def polish(
         focal: (g,) focal lengths, pixels; first guesses where the options refine them.
         shape: (4,) distortion of the lens as in `factors.distort` where the options refine the lens; None is none.
         groups: (images,) which of the focal lengths is that of each image; None: all have the first.
+        control: what is known beforehand, its marks normalised as the tracks are; it takes part at the end, and only
+            where the camera moves.
+
+    Raises:
+        ReconstructionError: what is known of the registered frames leaves open where the world of the control is.
     """
     o = options.polish
     registered = [i for i, image in enumerate(images) if image.registered]
     frames = _solved_frames(images, registered, o.max_frames)
+    if control is not None:
+        frames = sorted({*frames, *frames_under_control(registered, control, o.max_frames // 2)})
     used = [images[i] for i in frames]
     observations, tracks = _gather(used, min(o.min_track_length, max(2, len(used))))
-    group = np.zeros(len(images), np.int64) if groups is None else groups
-    state = _first_guess(used, observations, tracks, map_points, focal, group[frames])
+    groups = np.zeros(len(images), np.int64) if groups is None else groups
+    state = _first_guess(used, observations, tracks, map_points, focal, groups[frames])
 
     progress("polish: cameras")
     core, few, adjustment = _converge_cameras(state, observations, options)
     lens = None
     if options.refine_focal_length:
-        adjustment, lens = estimate_lens(adjustment, Lens(focal, np.zeros(4) if shape is None else shape), options)
-        few, observations = adjustment.observations, lens.renormalize(observations, state.group)
-        state = through(state, lens.lens.focal)
+        guess = Lens(focal, np.zeros(4) if shape is None else shape)
+        adjustment, lens = _estimate_lens(adjustment, guess, frames, options)
+        few, group = adjustment.observations, adjustment.state.group
+        observations = lens.renormalize(observations, group)
+        if control is not None:
+            zooms = len(lens.lens.focal) > len(focal)
+            whole, of_image = (
+                (_between(lens, frames, np.arange(len(images))), np.arange(len(images))) if zooms else (lens, groups)
+            )
+            control = replace(control, marks=whole.renormalize(control.marks, of_image))
+        state = through(replace(state, log_focal=np.log(lens.guess.focal), group=group), lens.lens.focal)
     motion = classify_motion(adjustment, few, o)
     inflation = block_inflation(adjustment.reprojection_vectors(), few)
     weighed = None
@@ -139,10 +164,50 @@ def polish(
         motion, pose_blocks(camera_covariance, k), observability,
         marginals.inverse_distance_std(camera_covariance), prior, lens,
     )  # fmt: skip
+    result.control_unused = control is not None and not free
+    if control is not None and free:
+        progress("polish: control")
+        _put_under_control(result, adjustment, control)
     if len(frames) < len(registered):
         progress("polish: frames between")
-        _add_frames_between(result, images, registered, group[registered], options)
+        group = groups[registered]
+        if lens is not None and len(lens.lens.focal) > len(focal):
+            group, lens = np.arange(len(registered)), _between(lens, frames, np.array(registered))
+            solved = np.searchsorted(registered, frames)
+            result.state, result.lens = replace(result.state, log_focal=np.log(lens.lens.focal), group=solved), lens
+        _add_frames_between(result, images, registered, group, options)
     return result
+
+
+def _put_under_control(result: Polished, adjustment: BundleAdjustment, control: LocatedControl) -> None:
+    """Everything as it is with the control; what carries each camera stays as the images and the prior have it."""
+    found = controlled(adjustment, control, result.frames)
+    k = len(result.frames)
+    result.state, result.errors = found.adjustment.state, found.adjustment.reprojection_errors()
+    result.covariance, result.datum, result.control = found.covariance, found.datum, found.fit
+    result.point_std = found.marginals.inverse_distance_std(found.camera_covariance)
+    if result.prior is not None:
+        result.prior.residual = found.adjustment.prior_residuals()
+        first = 6 * k + len(result.state.log_focal)
+        affine = np.sqrt(found.camera_covariance.diagonal()[first : first + 2 * len(result.prior.images)])
+        result.prior.scale_std, result.prior.shift_std = affine[::2], affine[1::2]
+
+
+def _estimate_lens(
+    adjustment: BundleAdjustment, guess: Lens, frames: list[int], options: Options
+) -> tuple[BundleAdjustment, LensEstimate]:
+    """As `estimate_lens`, with a focal length for every frame where a zoom is asked for and found."""
+    zoom = None
+    if options.lens == "zoom" and len(guess.focal) == 1:
+        zoom = find_zoom(adjustment, guess, np.array(frames, np.float64), options.polish)
+    if zoom is None or not zoom.found:
+        adjustment, lens = estimate_lens(adjustment, guess, options)
+        return adjustment, replace(lens, zoom_std=zoom.std if zoom else None)
+    zoomed = Lens(np.exp(zoom.adjustment.state.log_focal), guess.shape)
+    prior = np.zeros(len(frames)), zoom.information
+    adjustment, lens = estimate_lens(zoom.adjustment, zoomed, options, prior)
+    seen = Lens(np.repeat(guess.focal, len(frames)), guess.shape)
+    return adjustment, replace(lens, guess=seen, zoom_std=zoom.std)
 
 
 # --- set-up -----------------------------------------------------------------------------------------------------
@@ -343,6 +408,16 @@ def _solved_frames(images: list[MappedImage], registered: list[int], limit: int)
     others = [i for i in registered if not images[i].keyframe]
     fill = [others[k] for k in np.linspace(0, len(others) - 1, limit - len(keyframes)).astype(int)]
     return sorted(keyframes + fill)
+
+
+def _between(lens: LensEstimate, frames: list[int], wanted: Index) -> LensEstimate:
+    """Of a zoom that is known at some images, the lens at others."""
+    return replace(
+        lens,
+        guess=Lens(np.repeat(lens.guess.focal[:1], len(wanted)), lens.guess.shape),
+        lens=Lens(np.exp(np.interp(wanted, frames, np.log(lens.lens.focal))), lens.lens.shape),
+        focal_std=np.interp(wanted, frames, lens.focal_std),
+    )
 
 
 def _add_frames_between(

@@ -63,6 +63,7 @@ class State:
         lens: (4,) distortion and principal point as in `factors.distort`, where they are estimated.
         group: (k,) which of the focal lengths is that of each frame; by default all have the first.
         scale, shift: (images,) affine of each image with a prior.
+        control: datum and marked points, see `control_term`; empty without control.
         field: (nodes,) smooth error of the prior in units of inverse depth, shared by all its images.
     """
 
@@ -75,6 +76,7 @@ class State:
     group: Index = field(default_factory=lambda: np.zeros(0, np.int64))
     scale: Array = field(default_factory=lambda: np.zeros(0))
     shift: Array = field(default_factory=lambda: np.zeros(0))
+    control: Array = field(default_factory=lambda: np.zeros(0))
     field: Array = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:

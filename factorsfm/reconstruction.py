@@ -84,9 +84,11 @@ class LensFit:
 
     Attributes:
         determined: whether the focal length is an estimate; otherwise it is the guess.
-        focal_std: standard deviation of the focal length, relative.
+        focal_std: standard deviation of the focal length, relative; of a zoom the largest one.
         k1_std, k2_std: of the radial distortion.
         cx_std, cy_std: of the principal point, in focal lengths.
+        zoom_std: of the ratio of the longest to the shortest focal length, relative, where a zoom was looked for. The
+            course of a zoom is an estimate even where the focal length as a whole is a guess.
     """
 
     determined: bool
@@ -95,6 +97,47 @@ class LensFit:
     k2_std: float | None = None
     cx_std: float | None = None
     cy_std: float | None = None
+    zoom_std: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ControlResidual:
+    """How far one item of the control is from the result.
+
+    Attributes:
+        name: of the item; unit: of `error` and `sigma`: "m", "degrees" or "px".
+        error: length of the difference; sigma: as given; sigmas: the one over the other.
+        contradicts: whether the difference is so large that the item was given next to no weight.
+    """
+
+    name: str
+    unit: str
+    error: float
+    sigma: float
+    sigmas: float
+    contradicts: bool
+
+
+@dataclass(frozen=True, slots=True)
+class ControlFit:
+    """What the control did.
+
+    Attributes:
+        residuals: of every item that was used.
+        held: names of the frames whose poses were held exactly.
+        unused: what could not be used, and why.
+        placed: whether the result is in the world of the control; where only distances or heights are known, it is in
+            that of its first camera.
+        scale_std: relative standard deviation of the scene's size in the control's unit.
+        position_std: standard deviation of a camera's position in this world and unit, median over the cameras.
+    """
+
+    residuals: list[ControlResidual]
+    held: list[str]
+    unused: list[str]
+    placed: bool
+    scale_std: float
+    position_std: float
 
 
 @dataclass(slots=True)
@@ -113,10 +156,12 @@ class FrameResult:
         prior: fitted scale and shift of the depth prior, None where the frame carries none.
         covariance: (6, 6) of (rotation vector, translation), a perturbation of `world_from_cam` on the right, relative
             to the first registered camera in the scene's unit of length, which is the mean inverse distance of the
-            points; None where not registered, or where no point of the result is seen.
+            points; with control absolute, in the control's world and unit; None where not registered, or where no
+            point of the result is seen.
         observability: what carries the pose, None where not registered.
         thumbnail: a small JPEG of the image, None where none is kept.
         camera: the lens of this frame where the frames do not share one, else None; see `Reconstruction.camera_of`.
+        focal_std: relative standard deviation of the focal length of this frame, where it is an estimate of its own.
     """
 
     index: int
@@ -134,6 +179,7 @@ class FrameResult:
     observability: CameraObservability | None = None
     thumbnail: bytes | None = None
     camera: pycolmap.Camera | None = None
+    focal_std: float | None = None
 
     @property
     def registered(self) -> bool:
@@ -146,7 +192,8 @@ class Reconstruction:
     """Cameras, points and tracks of one shot.
 
     Attributes:
-        camera: the lens (COLMAP convention: pixel centres at 0.5) of all frames but those with one of their own.
+        camera: the lens (COLMAP convention: pixel centres at 0.5); where frames have lenses of their own, with the
+            median of their focal lengths, or of an image set that of most images.
         frames: one entry per frame of the source, in order.
         points: (n, 3) world coordinates.
         colors: (n, 3) uint8 RGB.
@@ -162,7 +209,8 @@ class Reconstruction:
         point_std: (n,) standard deviation of the inverse distance of each point from the first registered camera,
             relative to it, in the unit of `FrameResult.covariance`; None where it is not known.
         lens: how far the shot determines the lens; None where it was given.
-        metric: whether the world unit is the metre (the prior is metric).
+        metric: whether the world unit is the metre (the prior is metric, or control says so).
+        control: what control did; None where there was none.
         notes: sentences that a user should read (translation unobservable, focal length guessed, ...).
         seconds: wall time by stage.
         options: resolved options as plain data.
@@ -184,6 +232,7 @@ class Reconstruction:
     point_std: NDArray[np.float64] | None = None
     lens: LensFit | None = None
     metric: bool = False
+    control: ControlFit | None = None
     notes: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
     options: dict[str, Any] = field(default_factory=dict)
@@ -200,7 +249,7 @@ class Reconstruction:
 
     @property
     def has_own_lenses(self) -> bool:
-        """Whether some frames have a lens of their own."""
+        """Whether the focal length or more changes from frame to frame."""
         return any(frame.camera is not None for frame in self.frames)
 
     def camera_centers(self) -> NDArray[np.float64]:

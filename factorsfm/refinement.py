@@ -13,6 +13,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.control_term import ControlTerm
 from factorsfm.elimination import Block, Elimination, Normal, Term, conditioned, reduced
 from factorsfm.factors import affine_inverse_depth, by_pose, cauchy, cross_matrices, distort, reprojection
 from factorsfm.marginals import Marginals, tangent_basis
@@ -41,14 +42,15 @@ class BundleAdjustment:
         sigma: standard deviation of an observation (pixels).
         free_translation: False estimates rotations and bearings alone.
         free_focal: whether the focal lengths are estimated.
-        focal_information: (g, g) information matrix with which the logarithms of the focal lengths are known to be
-            zero, or, where it is singular, some combinations of them; None: nothing is known.
+        focal_prior: (g,) mean and (g, g) information matrix with which the logarithms of the focal lengths are known
+            beforehand; None: not at all.
         lens_sigmas: (4,) standard deviations with which `State.lens` is known beforehand (0: exactly); None: it is
             zero, the observations are undistorted.
         points_only: True holds everything but the points fixed.
-        fixed: (k,) frames whose poses are held; by default the first, which is the world. Those without observations are
-            held as well.
+        fixed: (k,) frames whose poses are held; by default the first, which is the world. Those without observations
+            are held as well.
         prior: depth-prior values, or None.
+        control: what is known beforehand of poses and points, or None.
     """
 
     def __init__(
@@ -60,11 +62,12 @@ class BundleAdjustment:
         sigma: float,
         free_translation: bool = True,
         free_focal: bool = False,
-        focal_information: Array | None = None,
+        focal_prior: tuple[Array, Array] | None = None,
         lens_sigmas: Array | None = None,
         points_only: bool = False,
         fixed: NDArray[np.bool_] | None = None,
         prior: PriorObservations | None = None,
+        control: ControlTerm | None = None,
     ) -> None:
         if (np.diff(observations.point) < 0).any():
             raise ValueError("observations must be sorted by point")
@@ -73,9 +76,10 @@ class BundleAdjustment:
         self.options = options
         self.sigma = sigma
         self.prior = prior
+        self.control = control
         self.iterations = 0
         self._anchor = state.inverse_distance.copy()
-        self._focal_information = focal_information
+        self._focal_prior = focal_prior
         self._group = state.group[observations.frame]
         self._lens_sigmas = lens_sigmas
         self._lens_anchor = state.lens
@@ -86,7 +90,8 @@ class BundleAdjustment:
         self._shape = self._lens + len(state.log_focal)
         self._affine = self._shape + (0 if lens_sigmas is None else 4)
         self._field = self._affine + 2 * images
-        self._columns = self._field + nodes
+        self._control = self._field + nodes
+        self._columns = self._control + len(state.control)
         free = np.ones(self._columns, bool)
         held = np.arange(frames) == 0 if fixed is None else fixed
         held = held | (np.bincount(observations.frame, minlength=frames) == 0)  # nothing says where they are
@@ -94,6 +99,8 @@ class BundleAdjustment:
         free[self._lens : self._shape] = free_focal
         if lens_sigmas is not None:
             free[self._shape : self._affine] = lens_sigmas > 0
+        if control is not None:
+            free[self._control :] = control.free
         if not free_translation:
             free[: self._lens].reshape(-1, 6)[:, 3:] = False
         self._free = np.nonzero(free & (not points_only))[0]
@@ -170,13 +177,16 @@ class BundleAdjustment:
         cost += 0.5 * (((state.inverse_distance - self._anchor) / self._point_sigma) ** 2).sum()
         difference, information = self._lens_prior(state)
         cost += 0.5 * (information * difference**2).sum()
-        if self._focal_information is not None:
-            cost += 0.5 * state.log_focal @ self._focal_information @ state.log_focal
+        if self._focal_prior is not None:
+            away = state.log_focal - self._focal_prior[0]
+            cost += 0.5 * away @ self._focal_prior[1] @ away
         if (p := self.prior) is not None:
             cost += cauchy(self._prior(state)[0][:, None], self.options.kernel)[0].sum()
             cost += 0.5 * state.field @ p.field_information @ state.field
             cost += 0.5 * (((state.scale - 1.0) / p.scale_sigma) ** 2).sum()
             cost += 0.5 * ((state.shift / p.shift_sigma) ** 2).sum()
+        if self.control is not None:
+            cost += self.control.cost(state)
         return float(cost)
 
     @property
@@ -242,10 +252,10 @@ class BundleAdjustment:
         )  # fmt: skip
         point[:, 2, 2] += 1.0 / self._point_sigma**2
         point_gradient[:, 2] += (s.inverse_distance - self._anchor) / self._point_sigma**2
-        if self._focal_information is not None:
-            focal = slice(self._lens, self._shape)
-            camera[focal, focal] += self._focal_information
-            gradient[focal] += self._focal_information @ s.log_focal
+        if self._focal_prior is not None:
+            focal, (mean, information) = slice(self._lens, self._shape), self._focal_prior
+            camera[focal, focal] += information
+            gradient[focal] += information @ (s.log_focal - mean)
         if self._lens_sigmas is not None:
             shape = np.arange(self._shape, self._affine)
             difference, information = self._lens_prior(s)
@@ -256,8 +266,11 @@ class BundleAdjustment:
             information = np.tile([p.scale_sigma**-2.0, p.shift_sigma**-2.0], len(s.scale))
             camera[affine, affine] += information
             gradient[affine] += information * np.stack([s.scale - 1.0, s.shift], -1).ravel()
-            camera[self._field :, self._field :] += p.field_information
-            gradient[self._field :] += p.field_information @ s.field
+            field = slice(self._field, self._control)
+            camera[field, field] += p.field_information
+            gradient[field] += p.field_information @ s.field
+        if self.control is not None:
+            self.control.add(s, camera, gradient, self._control)
         return normal
 
     # --- solving ------------------------------------------------------------------------------------------------
@@ -305,7 +318,8 @@ class BundleAdjustment:
             lens=s.lens if self._lens_sigmas is None else s.lens + camera[self._shape : self._affine],
             scale=s.scale + affine[:, 0],
             shift=s.shift + affine[:, 1],
-            field=s.field + camera[self._field :],
+            control=s.control + camera[self._control :],
+            field=s.field + camera[self._field : self._control],
             group=s.group,
         )
 
@@ -344,7 +358,7 @@ class BundleAdjustment:
 
         Returns:
             (c, c) over the columns (six per frame in GTSAM's pose convention, log focal lengths, scale and shift per
-            image, field), zero where a column is fixed; (p, p) of the inverse distances of `points`.
+            image, field, control), zero where a column is fixed; (p, p) of the inverse distances of `points`.
         """
         marginals = self.marginals()
         camera, given_camera = marginals.camera, marginals.point

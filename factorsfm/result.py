@@ -10,6 +10,8 @@ import pycolmap
 from numpy.typing import NDArray
 
 from factorsfm.camera import with_focal, with_lens
+from factorsfm.controlled import control_notes
+from factorsfm.evaluation.alignment import Similarity
 from factorsfm.images import MappedImage
 from factorsfm.lens import LensEstimate
 from factorsfm.observability import observability_notes
@@ -66,6 +68,8 @@ def assemble(
             f"The focal length is {origin} ({pixels_long}): no camera was given, and the lens was to stay fixed."
         )
     scale = _metric_scale(polished, images) if metric else None
+    if polished.datum is not None:
+        scale = polished.datum.scale
     unit = scale or 1.0
     lens = polished.lens
     if lens is not None:
@@ -83,7 +87,7 @@ def assemble(
         xy[mine] = pixels[positions[k]][np.searchsorted(ids, polished.tracks[point[mine]])]
     points = state.bearing[kept] / state.inverse_distance[kept, None] * unit
     general = polished.motion.kind is ShotKind.GENERAL
-    frame_results = _frame_results(polished, images, frames, unit)
+    frame_results = _frame_results(polished, images, frames, camera, unit)
     notes += observability_notes(frame_results)
     prior_residual = np.full(len(observations.point), np.nan)
     if polished.prior is not None:
@@ -93,7 +97,7 @@ def assemble(
         at = np.searchsorted(key, (p.observations.point * (len(positions) + 1) + p.observations.frame)[order])
         predicted = p.residual + p.observations.inverse_depth - state.shift[p.observations.image]
         prior_residual[at] = (p.residual / np.maximum(np.abs(predicted), 1e-6))[order]
-    return Reconstruction(
+    result = Reconstruction(
         camera=camera,
         frames=frame_results,
         points=points,
@@ -109,10 +113,22 @@ def assemble(
         point_std=polished.point_std[kept] / state.inverse_distance[kept] if general else None,
         lens=_lens_fit(lens) if lens is not None else None,
         metric=scale is not None,
+        control=polished.control,
         notes=notes,
         seconds=seconds,
         options=options,
     )
+    if polished.datum is not None:
+        _place(result, polished.datum)
+    return result
+
+
+def _place(result: Reconstruction, datum: Similarity) -> None:
+    """Turn and move a result of the right size into the world of its control."""
+    world_from_first = pycolmap.Rigid3d(pycolmap.Rotation3d(datum.rotation), datum.translation)
+    for frame in result.registered:
+        frame.cam_from_world = frame.cam_from_world * world_from_first.inverse()
+    result.points = result.points @ datum.rotation.T + datum.translation
 
 
 def _usable_points(polished: Polished) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
@@ -143,9 +159,9 @@ def _metric_scale(polished: Polished, images: list[MappedImage]) -> float | None
 
 
 def _frame_results(
-    polished: Polished, images: list[MappedImage], frames: Sequence[SeenFrame], unit: float
+    polished: Polished, images: list[MappedImage], frames: Sequence[SeenFrame], camera: pycolmap.Camera, unit: float
 ) -> list[FrameResult]:
-    state, o = polished.state, polished.observations
+    state, o, lens = polished.state, polished.observations, polished.lens
     threshold = _INLIER_SIGMAS * polished.sigma
     seen = np.bincount(o.frame, minlength=len(polished.frames))
     inliers = np.bincount(o.frame, polished.errors < threshold, len(polished.frames)).astype(int)
@@ -166,6 +182,10 @@ def _frame_results(
             result.inliers = int(inliers[row])
             result.reprojection_error = float(error[row])
             result.prior = prior.get(row)
+            if len(state.log_focal) > 1:
+                result.camera = with_focal(camera, float(state.focal[row]))
+                if lens is not None and lens.determined:
+                    result.focal_std = float(lens.focal_std[state.group[row]])
             if seen[row]:
                 covariance = polished.covariance[row].copy()
                 covariance[3:] *= unit
@@ -213,23 +233,36 @@ def _notes(polished: Polished, has_depth: bool) -> list[str]:
         )
     if polished.lens is not None:
         notes.append(_lens_note(polished.lens))
+    if polished.control is not None:
+        notes += control_notes(polished.control)
+    if polished.control_unused:
+        notes.append("Control: not used, since a camera that stays in its place ties no lengths to the images.")
     return notes
 
 
 def _lens_note(estimate: LensEstimate) -> str:
-    focal, std = float(np.median(estimate.lens.focal)), f"standard deviation {100 * estimate.focal_std.max():.1f} %"
+    focals, std = estimate.lens.focal, f"standard deviation {100 * estimate.focal_std.max():.1f} %"
+    focal, zoom = float(np.median(focals)), ""
+    if estimate.zoom_std is not None and len(focals) == 1:
+        zoom = f" No zoom was found: what it might be is less than {200 * estimate.zoom_std:.1f} %."
+    elif estimate.zoom_std is not None:
+        zoom = (
+            f" It changes from {focals[0]:.0f} to {focals[-1]:.0f} pixels; the ratio of the longest to the shortest is "
+            f"{focals.max() / focals.min():.3f} ± {estimate.zoom_std * focals.max() / focals.min():.3f}."
+        )
     if not estimate.determined:
         reason = f"this shot does not determine it ({std})"
         if estimate.misfit_px:
             reason = f"the tracks fit no lens (typical error {estimate.misfit_px:.2f} pixels)"
-        return f"The focal length is a guess ({focal:.0f} pixels): {reason}."
+        return f"The focal length is a guess ({focal:.0f} pixels): {reason}.{zoom}"
     note = f"The focal length was estimated: {focal:.0f} pixels, {std}"
     if np.isfinite(estimate.shape_std[0]):
         k, k_std = estimate.lens.shape, estimate.shape_std
         note += f"; radial distortion k1 {k[0]:.3f} ± {k_std[0]:.3f}, k2 {k[1]:.3f} ± {k_std[1]:.3f}"
-    return note + "."
+    return f"{note}.{zoom}"
 
 
 def _lens_fit(estimate: LensEstimate) -> LensFit:
-    shape = [float(std) if np.isfinite(std) else None for std in estimate.shape_std]
-    return LensFit(estimate.determined, float(estimate.focal_std.max()) if estimate.determined else None, *shape)
+    k1, k2, x, y = (float(std) if np.isfinite(std) else None for std in estimate.shape_std)
+    focal_std = float(estimate.focal_std.max()) if estimate.determined else None
+    return LensFit(estimate.determined, focal_std, k1, k2, x, y, estimate.zoom_std)

@@ -96,6 +96,7 @@ class SetMapper:
         self._common = _common_tracks(tracks)
         self._order: list[MappedImage] = []  # of registration; the first one is the world
         self._adjusted = 0
+        self._held: set[int] = set()  # positions of the images whose poses are given
         self._angle = 0.0  # median angle between the rays of the latest points, degrees
 
     @property
@@ -130,6 +131,23 @@ class SetMapper:
         self.points = best_points
         if self._order:
             self._grow(None)
+
+    def extend(self, known: dict[int, tuple[Array, Array]]) -> None:
+        """Register all images that can be on those whose poses are known, which stay as they are.
+
+        Args:
+            known: `cam_from_world` rotation and translation by position, the first one near the origin of a world with
+                a median distance of about 1.
+        """
+        for position, pose in known.items():
+            self._accept(self.images[position], *pose, 0)
+        self._held = set(known)
+        self._grow(None)
+        for image in self.images:
+            if image.status is FrameStatus.WAITING:
+                mapped = int(self.points.contains(image.tracks.ids).sum())
+                image.status = FrameStatus.LOST
+                image.message = f"{mapped} of {self.options.min_inliers} needed tracks have a point in the map"
 
     def _usable(self) -> list[int]:
         """The images of the largest component; the others learn why they are left out."""
@@ -318,7 +336,10 @@ class SetMapper:
         errors = BundleAdjustment(state, observations, self._adjustment, sigma=1.0).reprojection_errors()
         sigma = max(float(np.median(errors)), _SIGMA_PX)
         free_focal = self._refine_focal and len(self._order) >= _FOCAL_IMAGES and self._angle > _FOCAL_ANGLE_DEG
-        adjustment = BundleAdjustment(state, observations, self._adjustment, sigma=sigma, free_focal=free_focal)
+        held = np.array([image.tracks.position in self._held for image in self._order]) if self._held else None
+        adjustment = BundleAdjustment(
+            state, observations, self._adjustment, sigma=sigma, free_focal=free_focal, fixed=held
+        )
         state = adjustment.solve()
         focal = float(np.exp(state.log_focal[0]))
         if free_focal and 0.3 < focal / self._guess < 3.0:

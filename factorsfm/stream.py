@@ -27,6 +27,7 @@ from factorsfm.camera import (
     with_focal,
 )
 from factorsfm.closing import Closing
+from factorsfm.control import Control, LocatedControl, locate
 from factorsfm.errors import InputError, ModelError, ReconstructionError
 from factorsfm.frame_update import FrameUpdate, KeyframePrior
 from factorsfm.frames import Frame, as_frame
@@ -71,6 +72,7 @@ class Stream(Closing):
         depth: prior, or None.
         masks: what to ignore, or None.
         options: see `Options`; None is the default preset.
+        control: what is known beforehand of poses and points; it takes part in `finish`. Not part of snapshots.
 
     Example:
         >>> stream = factorsfm.Stream(camera, depth=factorsfm.DepthModel("model.onnx"))  # doctest: +SKIP
@@ -86,9 +88,11 @@ class Stream(Closing):
         depth: DepthPrior | None = None,
         masks: MaskPrior | None = None,
         options: Options | None = None,
+        control: Control | None = None,
     ) -> None:
         self.camera = camera
         self._lens_given = camera is not None
+        self.control = control
         self.options = options or Options()
         self.seconds: dict[str, float] = defaultdict(float)
         self.frames: list[SeenFrame] = []
@@ -229,17 +233,22 @@ class Stream(Closing):
         """Polish over all frames and tracks.
 
         Raises:
+            InputError: the control names a frame that is not there.
             ReconstructionError: no frame could be registered, or too few points remain.
         """
         mapper = self._mapper
         if mapper is None or len(self.frames) < 2:
             raise self._failure(f"frames in the shot: {len(self.frames)}, at least 2 needed")
         with self:
-            return self._polished(mapper, progress)
+            try:
+                return self._polished(mapper, progress)
+            except ReconstructionError as error:
+                raise error if error.frames else self._failure(str(error)) from error
 
     def _polished(self, mapper: Mapper, progress: Callable[[str, int, int | None], None] | None) -> Reconstruction:
         with self._timed("mapping"):
             mapper.finish()
+        control = self._located_control()
         for image, seen in zip(mapper.images, self.frames, strict=True):
             _mark_blank(image, seen.texture)
         registered = sum(image.registered for image in mapper.images)
@@ -257,6 +266,7 @@ class Stream(Closing):
                 self.options,
                 lambda stage: progress(stage, 0, None) if progress else None,
                 lens_shape(self.camera) if self.options.refine_focal_length else None,
+                control=control,
             )
         reconstruction = assemble(
             result,
@@ -276,6 +286,11 @@ class Stream(Closing):
             reconstruction.notes.append(f"Frames that went without depth because the prior failed: {count}; {first}.")
         self._thumbnails.attach(reconstruction.frames)
         return reconstruction
+
+    def _located_control(self) -> LocatedControl | None:
+        if self.control is None:
+            return None
+        return locate(self.control, self.frames, lambda position, xy: normalized_from_pixels(self.camera, xy))
 
     def close(self) -> None:
         """Give up without a result; `finish` closes, too."""

@@ -42,9 +42,11 @@ def summary(reconstruction: Reconstruction) -> dict[str, Any]:
         "parallax": reconstruction.parallax,
         "kind": reconstruction.kind,
         "metric": reconstruction.metric,
+        "control": reconstruction.control and asdict(reconstruction.control),
         "reprojection_error": median_reprojection_error(reconstruction),
         "observability": pooled_observability(reconstruction),
         "focal_length": reconstruction.camera.mean_focal_length(),
+        "focal_range": focal_range(reconstruction),
         "camera": camera_to_json(reconstruction.camera),
         "lens": reconstruction.lens and asdict(reconstruction.lens),
         "seconds": with_total(reconstruction.seconds),
@@ -112,6 +114,12 @@ def median_reprojection_error(reconstruction: Reconstruction) -> float:
     return float(np.median(errors)) if len(errors) else float("nan")
 
 
+def focal_range(reconstruction: Reconstruction) -> tuple[float, float] | None:
+    """Shortest and longest focal length of the frames, pixels; None where they share one."""
+    focals = [frame.camera.mean_focal_length() for frame in reconstruction.frames if frame.camera is not None]
+    return (min(focals), max(focals)) if focals else None
+
+
 def pooled_observability(reconstruction: Reconstruction) -> dict[str, float] | None:
     """Medians over the registered cameras, and the largest pixel slide; None where nothing is known."""
     cameras = [asdict(f.observability) for f in reconstruction.frames if f.observability is not None]
@@ -156,6 +164,8 @@ def _frame_json(frame: FrameResult) -> dict[str, Any]:
             "sigma": prior.sigma,
         },
         "observability": frame.observability and asdict(frame.observability),
+        "focal_length": frame.camera and frame.camera.mean_focal_length(),
+        "focal_std": frame.focal_std,
     }
 
 

@@ -16,7 +16,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.camera import PIXEL_CENTER, camera_to_json
+from factorsfm.camera import PIXEL_CENTER, camera_to_json, with_focal
 from factorsfm.errors import InputError
 
 Motion = Literal["dolly", "truck", "handheld", "rotation", "static", "arc"]
@@ -173,14 +173,16 @@ class RenderedShot:
     Attributes:
         images: (h, w, 3) uint8 BGR per frame.
         depths: (h, w) float32 per frame: exact z-depth at the pixel centres, world units.
-        camera: the lens.
+        camera: the lens of the first frame.
         cam_from_world: one pose per frame.
+        zoom: (k,) focal length of each frame, relative to the first one.
     """
 
     images: list[NDArray[np.uint8]]
     depths: list[NDArray[np.float32]]
     camera: pycolmap.Camera
     cam_from_world: list[pycolmap.Rigid3d]
+    zoom: Floats
 
 
 def render_shot(
@@ -190,6 +192,7 @@ def render_shot(
     height: int = 270,
     parallax: float = 0.05,
     seed: int = 0,
+    zoom: float = 1.0,
 ) -> RenderedShot:
     """Render a textured room with boxes between 2 and 7 units in front of the camera.
 
@@ -200,20 +203,29 @@ def render_shot(
         parallax: largest distance of a camera from the first one over the median depth of the first image,
             exact; beyond about 0.3 the camera may run into a box.
         seed: of the room, its textures and the handheld sway.
+        zoom: focal length of the last frame over that of the first; between them it changes softly.
 
     Raises:
-        InputError: an unknown motion, fewer than 2 frames, or a parallax outside 0 to 1.
+        InputError: an unknown motion, fewer than 2 frames, a parallax outside 0 to 1, or a zoom that is not positive.
     """
+    if not zoom > 0:
+        raise InputError(f"a synthetic shot with a zoom of {zoom:g} was asked for; it must be above 0")
     camera = room_camera(width, height)
     quads = _room(np.random.default_rng(seed))
     depth = float(np.median(1 / _cast(quads, camera, pycolmap.Rigid3d(), 1).inverse_depth))
     path = _camera_path(motion, frames, parallax, depth, seed)
     textures = [_texture(np.random.default_rng([seed, i]), quad, camera.focal_length_x) for i, quad in enumerate(quads)]
+    time = np.linspace(0, 1, frames)
+    zooms = zoom ** (time**2 * (3 - 2 * time))
+    views = [
+        (with_focal(camera, camera.focal_length_x * factor), pose) for factor, pose in zip(zooms, path, strict=True)
+    ]
     return RenderedShot(
-        images=[_render(quads, textures, camera, pose) for pose in path],
-        depths=[(1 / _cast(quads, camera, pose, 1).inverse_depth).astype(np.float32) for pose in path],
+        images=[_render(quads, textures, lens, pose) for lens, pose in views],
+        depths=[(1 / _cast(quads, lens, pose, 1).inverse_depth).astype(np.float32) for lens, pose in views],
         camera=camera,
         cam_from_world=path,
+        zoom=zooms,
     )
 
 

@@ -315,6 +315,14 @@ def test_a_rotating_camera_gets_its_rotation_and_no_translation(preset: str) -> 
     assert 1e-5 < errors.max() < 0.05  # of 12 degrees
 
 
+def test_a_camera_that_only_turns_takes_no_control() -> None:
+    control = factorsfm.Control(distances=[factorsfm.KnownDistance(0.5, 0.01, frames=(0, FRAMES - 1))])
+    result = reconstruct(rendered("rotation").images, Maps(simulated_maps("rotation")), control=control)
+    assert_rotation(result)
+    assert result.control is None
+    assert any(note.startswith("Control: not used") for note in result.notes)
+
+
 def test_a_tripod_pan_of_the_development_data(shared_data: Path) -> None:
     shot = read_shot(shared_data / "studiosim" / "d10_keep_tripod_pan")
     result = factorsfm.reconstruct(shot.source, camera=shot.camera, depth=None, frames=slice(0, 36, 3))

@@ -63,6 +63,7 @@ def test_reconstruct_writes_the_result(
         "masks": None,
         "frames": None,
         "lens": "auto",
+        "control": None,
         "preset": "default",
         "unordered": None,
         "work": None,

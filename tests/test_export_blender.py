@@ -21,7 +21,9 @@ from export_problems import (
 )
 from numpy.typing import NDArray
 
+from factorsfm.camera import with_focal
 from factorsfm.export import ExportOptions, export
+from factorsfm.reconstruction import Reconstruction
 
 SCALE = 3.0
 BLENDER = shutil.which("blender")
@@ -29,11 +31,11 @@ BLENDER = shutil.which("blender")
 pytestmark = pytest.mark.skipif(BLENDER is None, reason="Blender is not installed (Debian's package: blender)")
 
 
-def run_blender(folder: Path, footage: Path | None) -> dict[str, Any]:
+def run_blender(folder: Path, footage: Path | None, shown: Reconstruction | None = None) -> dict[str, Any]:
     pytest.importorskip("OpenEXR", reason="OpenEXR (extra vfx) is not installed")
     reconstruction = hard_reconstruction()
     options = ExportOptions(scale=SCALE, fps=30000 / 1001, footage=footage)
-    export(reconstruction, folder / "scene.py", format="blender", options=options)
+    export(shown or reconstruction, folder / "scene.py", format="blender", options=options)
     export(reconstruction, folder / "camera.chan", format="chan", options=options)
     export(reconstruction, folder / "nuke", format="nuke", options=options)
     probe = Path(__file__).with_name("blender_probe.py")
@@ -79,6 +81,18 @@ def test_blender_s_camera_is_ours_in_every_frame(report: dict[str, Any]) -> None
         window = world @ (np.array(entry["projection"]) @ np.linalg.inv(found[position])).T
         window = window[:, :2] / window[:, 3:]
         np.testing.assert_allclose((window + 1) / 2 * [640, -480] + [0, 480], pixels, atol=2e-3)
+
+
+def test_blender_s_camera_zooms(tmp_path: Path) -> None:
+    reconstruction = hard_reconstruction()
+    mean, factor = reconstruction.camera.mean_focal_length(), 1.0 + 0.05 * np.arange(5)
+    for k, frame in zip(factor, reconstruction.registered, strict=True):
+        frame.camera = with_focal(reconstruction.camera, mean * k)
+    scene = run_blender(tmp_path, None, reconstruction)["scene"]
+    found = {entry["frame"]: entry["lens"] for entry in scene["frames"]}
+    wanted = numbers(reconstruction, 1)
+    np.testing.assert_allclose([found[number] for number in wanted], 600 * 36 / 640 * factor, rtol=1e-6)
+    assert found[17] == pytest.approx((found[15] + found[19]) / 2, rel=1e-5)  # linear over the frame that is missing
 
 
 def test_blender_interpolates_across_the_gap(report: dict[str, Any]) -> None:

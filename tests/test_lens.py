@@ -65,7 +65,7 @@ def test_the_gradient_of_the_lens_columns_is_that_of_the_cost(kernel, group):
     options = PolishOptions(kernel=kernel)
     adjustment = BundleAdjustment(
         start, problem.observations, options, sigma=0.5, free_focal=True, lens_sigmas=sigmas,
-        focal_information=information,
+        focal_prior=(focal + 0.1, information),
     )  # fmt: skip
     adjustment.state = replace(
         start, lens=start.lens + 0.01, log_focal=start.log_focal + 0.01 * np.arange(1, groups + 1)

@@ -17,7 +17,7 @@ import pytest
 from onnx import helper
 from test_models import save_network
 
-from factorsfm import PRESETS, DepthKind, FrameStatus, ShotKind, cli, read_camera, reconstruct
+from factorsfm import PRESETS, DepthKind, FrameStatus, ShotKind, cli, read_camera, read_control, reconstruct
 from factorsfm.export import FORMATS
 from factorsfm.priors import models
 from factorsfm.synthetic import render_shot, write_shot
@@ -25,7 +25,7 @@ from factorsfm.synthetic import render_shot, write_shot
 ROOT = Path(__file__).resolve().parents[1]
 TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
-COMMANDS = ("reconstruct", "stream", "batch", "export", "overlay", "demo")
+COMMANDS = ("reconstruct", "stream", "batch", "extend", "export", "overlay", "demo")
 FRAMES = 10
 FILES = {"trajectory.tum", "colmap", "points.ply", "summary.json", "report.html"}
 
@@ -57,13 +57,17 @@ def material(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("readme")
     shot = render_shot(frames=FRAMES, width=256, height=144)
     write_shot(shot, folder)
-    for name in ("images", "masks", "networks"):
+    for name in ("images", "masks", "networks", "stills"):
         (folder / name).mkdir()
     mask = np.zeros((90, 160), np.uint8)
     mask[60:, :30] = 255
     for index, image in enumerate(shot.images):
         cv2.imwrite(str(folder / "images" / f"{index}.png"), image)
         cv2.imwrite(str(folder / "masks" / f"{index:06d}.png"), mask)
+    for index, image in enumerate(render_shot("arc", frames=3, width=256, height=144, parallax=0.1).images[1:]):
+        cv2.imwrite(str(folder / "stills" / f"still_{index}.png"), image)
+    (control,) = (block.text for block in blocks("json") if "poses" in block.text)
+    (folder / "control.json").write_text(control)
     brightness = helper.make_node("ReduceMean", ["image"], ["mean"], axes=[1], keepdims=1)
     nodes = [brightness, helper.make_node("Softplus", ["mean"], ["out"])]
     network = save_network(folder / "network.onnx", [1, 3, 48, 80], nodes)
@@ -103,6 +107,12 @@ def test_command(block: Block, place: Path, monkeypatch: pytest.MonkeyPatch) -> 
             assert {path.name for path in output.iterdir()} == FILES
             summary = json.loads((output / "summary.json").read_text())
             assert summary["registered"] == summary["frames"] == FRAMES
+            assert ("--control" in words) == (summary["control"] is not None)
+            assert not any(item["contradicts"] for item in (summary["control"] or {"residuals": []})["residuals"])
+        elif words[1] == "extend":
+            assert {path.name for path in output.iterdir()} == FILES
+            summary = json.loads((output / "summary.json").read_text())
+            assert summary["registered"] == summary["frames"] == FRAMES + 2
         elif words[1] == "batch":
             assert {path.name for path in (output / "film" / "shot_001").iterdir()} == FILES
             index = json.loads((output / "index.json").read_text())
@@ -125,8 +135,11 @@ def test_python(block: Block, place: Path, capsys: pytest.CaptureFixture[str]) -
 
 
 @each("json")
-def test_camera_file(block: Block, tmp_path: Path) -> None:
+def test_file(block: Block, tmp_path: Path) -> None:
     (tmp_path / "camera.json").write_text(block.text)
+    if "poses" in block.text:
+        assert read_control(tmp_path / "camera.json").frames == ["0", "9", 0, 9]
+        return
     camera = read_camera(tmp_path / "camera.json")
     assert (camera.width, camera.height) == (320, 180)
     np.testing.assert_allclose(

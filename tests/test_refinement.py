@@ -271,7 +271,12 @@ def test_what_is_known_of_the_focal_lengths_holds_them_together():
     spreads = []
     for sigma in (1e3, 1e-7):
         adjustment = BundleAdjustment(
-            truth, problem.observations, EXACT, sigma=0.3, free_focal=True, focal_information=step.T @ step / sigma**2
+            truth,
+            problem.observations,
+            EXACT,
+            sigma=0.3,
+            free_focal=True,
+            focal_prior=(truth.log_focal, step.T @ step / sigma**2),
         )
         spreads.append(np.ptp(adjustment.solve().log_focal))
     assert spreads[0] > 1e-3

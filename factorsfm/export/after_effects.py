@@ -30,7 +30,7 @@ def write_after_effects(shot: Shot, folder: Path) -> None:
     camera = [
         _track("Transform\tPosition", "X pixels\tY pixels\tZ pixels", frames, positions),
         _track("Transform\tOrientation", "X degrees\tY degrees\tZ degrees", frames, orientations),
-        _track("Camera Options\tZoom", "pixels", frames, np.full((len(frames), 1), lens.fx)),
+        _track("Camera Options\tZoom", "pixels", frames, np.array([[own.fx] for own in shot.lenses])),
     ]
     once = [shot.first]
     footage = [

@@ -40,15 +40,18 @@ def _write_camera(shot: Shot, archive: Any, sampling: int, geom: Any, imath: Any
         sample = geom.XformSample()
         sample.setMatrix(imath.M44d(*matrix.T.ravel().tolist()))
         transform.getSchema().set(sample)
-    sample = geom.CameraSample()
-    sample.setFocalLength(lens.focal_length)
-    sample.setHorizontalAperture(lens.sensor_width / 10)
-    sample.setVerticalAperture(lens.sensor_height / 10)
-    sample.setHorizontalFilmOffset(lens.right / 10)
-    sample.setVerticalFilmOffset(lens.up / 10)
-    sample.setNearClippingPlane(shot.clipping[0])
-    sample.setFarClippingPlane(shot.clipping[1])
-    geom.OCamera(transform, f"{CAMERA}Shape").getSchema().set(sample)
+    name = f"{CAMERA}Shape"
+    camera = geom.OCamera(transform, name, sampling) if shot.zooms else geom.OCamera(transform, name)
+    for own in shot.lenses if shot.zooms else [lens]:
+        sample = geom.CameraSample()
+        sample.setFocalLength(own.focal_length)
+        sample.setHorizontalAperture(lens.sensor_width / 10)
+        sample.setVerticalAperture(lens.sensor_height / 10)
+        sample.setHorizontalFilmOffset(lens.right / 10)
+        sample.setVerticalFilmOffset(lens.up / 10)
+        sample.setNearClippingPlane(shot.clipping[0])
+        sample.setFarClippingPlane(shot.clipping[1])
+        camera.getSchema().set(sample)
 
 
 def _write_points(shot: Shot, archive: Any, geom: Any, imath: Any) -> None:

@@ -45,14 +45,17 @@ for frame, location, rotation in zip(DATA["frames"], DATA["locations"], DATA["ro
     camera.rotation_quaternion = rotation
     camera.keyframe_insert("location", frame=frame)
     camera.keyframe_insert("rotation_quaternion", frame=frame)
-action = camera.animation_data.action
-if hasattr(action, "fcurves"):
-    curves = list(action.fcurves)
-else:  # since Blender 5
-    bags = [bag for layer in action.layers for strip in layer.strips for bag in strip.channelbags]
-    curves = [curve for bag in bags for curve in bag.fcurves]
-for key in [key for curve in curves for key in curve.keyframe_points]:
-    key.interpolation = "LINEAR"
+for frame, focal_length in zip(DATA["frames"], DATA["focal_lengths"]):  # of a zoom
+    lens.lens = focal_length
+    lens.keyframe_insert("lens", frame=frame)
+for action in [data.animation_data.action for data in (camera, lens) if data.animation_data]:
+    if hasattr(action, "fcurves"):
+        curves = list(action.fcurves)
+    else:  # since Blender 5
+        bags = [bag for layer in action.layers for strip in layer.strips for bag in strip.channelbags]
+        curves = [curve for bag in bags for curve in bag.fcurves]
+    for key in [key for curve in curves for key in curve.keyframe_points]:
+        key.interpolation = "LINEAR"
 
 mesh = bpy.data.meshes.new("factorsfm points")
 mesh.from_pydata(DATA["points"], [], [])
@@ -107,6 +110,7 @@ def _data(shot: Shot) -> dict[str, Any]:
         "range": (shot.first, shot.last),
         "sensor": (lens.sensor_width, lens.sensor_height),
         "focal_length": lens.focal_length,
+        "focal_lengths": [own.focal_length for own in shot.lenses] if shot.zooms else [],
         "shift": (lens.right / lens.sensor_width, lens.up / lens.sensor_width),
         "clip": shot.clipping,
         "frames": shot.numbers,

@@ -27,8 +27,9 @@ class _Observations(NamedTuple):
 def write_colmap(reconstruction: Reconstruction, folder: str | Path) -> None:
     """Write ``cameras.txt``, ``images.txt`` and ``points3D.txt``; the folder is made if absent.
 
-    The image id is the frame index + 1, the point id the row in ``reconstruction.points`` + 1. Points seen
-    from fewer than two registered frames are left out. Pixel centres lie at 0.5, as in all of COLMAP.
+    One camera for each lens of the registered frames. The image id is the frame index + 1, the point id the row in
+    ``reconstruction.points`` + 1. Points seen from fewer than two registered frames are left out. Pixel centres lie at
+    0.5, as in all of COLMAP.
     The text format cannot hold a blank in an image name; where there is one, the binary files are
     written as well (readers prefer them).
     """
@@ -87,12 +88,12 @@ def _observations(reconstruction: Reconstruction) -> _Observations:
 
 
 def _cameras(reconstruction: Reconstruction) -> list[pycolmap.Camera]:
-    """The different lenses of the registered frames, that of the reconstruction first."""
-    cameras = [reconstruction.camera]
-    for frame in reconstruction.registered:
-        if frame.camera is not None and frame.camera not in cameras:
-            cameras.append(frame.camera)
-    return cameras
+    """The different lenses of the registered frames."""
+    cameras: list[pycolmap.Camera] = []
+    for camera in map(reconstruction.camera_of, reconstruction.registered):
+        if camera not in cameras:
+            cameras.append(camera)
+    return cameras or [reconstruction.camera]
 
 
 def _image_lines(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import shutil
 from pathlib import Path, PurePath
 from typing import Any
@@ -38,7 +39,7 @@ def write_nerfstudio(shot: Shot, folder: Path) -> None:
     """Write ``transforms.json``, ``points.ply`` and, where the footage is at hand, ``images/``.
 
     Camera axes x right, y up, looking along -z; the principal point counts from the image's corner; distortion is
-    included. Frames that are not registered are left out.
+    included. A frame with a lens of its own has its parameters beside it. Frames that are not registered are left out.
 
     Raises:
         InputError: nerfstudio does not know the lens model, or the footage lacks frames.
@@ -66,7 +67,15 @@ def write_nerfstudio(shot: Shot, folder: Path) -> None:
     if shot.footage is None:
         logger.warning("there is no footage: put the frames into images/ under the names of transforms.json")
     else:
-        _write_images(shot.footage, names, folder / "images")
+        (folder / "images").mkdir()
+        added = [(part["source"], part["first"]) for part in shot.reconstruction.options.get("added", [])]
+        sources = [(shot.footage, 0), *added]
+        for (source, first), last in zip(sources, [*(first for _, first in added), math.inf], strict=True):
+            here = {index - first: name for index, name in names.items() if first <= index < last}
+            if source is None:
+                logger.warning("there are no files of %s: put these images into images/", ", ".join(here.values()))
+            elif here:
+                _write_images(Path(source), here, folder / "images")
 
 
 def _lens(camera: pycolmap.Camera) -> dict[str, Any]:
@@ -89,7 +98,6 @@ def _lens(camera: pycolmap.Camera) -> dict[str, Any]:
 
 def _write_images(footage: Path, names: dict[int, str], folder: Path) -> None:
     """Image files are copied as they are, frames of a video are written without loss."""
-    folder.mkdir()
     missing = {index for index, name in names.items() if not (footage / name).is_file()}
     for index in names.keys() - missing:
         shutil.copyfile(footage / names[index], folder / names[index])

@@ -33,10 +33,10 @@ def write_chan(shot: Shot, path: Path) -> None:
     the film back, which the tool must be told: sensor width, and sensor width times height over width.
     """
     angles = angles_zxy(shot.world_from_film[:, :3, :3])
-    field = math.degrees(2 * math.atan(shot.lens.height / (2 * shot.lens.fy)))
+    fields = [math.degrees(2 * math.atan(lens.height / (2 * lens.fy))) for lens in shot.lenses]
     lines = [
         " ".join([str(number), *(f"{value:.12g}" for value in (*matrix[:3, 3], *angle, field))])
-        for number, matrix, angle in zip(shot.numbers, shot.world_from_film, angles, strict=True)
+        for number, matrix, angle, field in zip(shot.numbers, shot.world_from_film, angles, fields, strict=True)
     ]
     path.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
 
@@ -67,7 +67,7 @@ def _script(shot: Shot) -> str:
         parts.append(_node("StickyNote", inputs=0, name="NotRegistered", label=f'"No camera at frames {lost}"'))
     parts += [_plate(shot, footage), "set plate [stack 0]"]
     if shot.distorts:
-        parts += [_map_reader(UNDISTORT), "push $plate", _stmap("Undistort"), "set plain_plate [stack 0]"]
+        parts += [_map_reader(shot, UNDISTORT), "push $plate", _stmap("Undistort"), "set plain_plate [stack 0]"]
     else:
         parts += ["push $plate", "set plain_plate [stack 0]"]
     parts += [
@@ -83,7 +83,7 @@ def _script(shot: Shot) -> str:
             *("push $camera", "push $points", "push 0"),
             _node("ScanlineRender", inputs=3, name="RenderPoints"),
             "set render [stack 0]",
-            *(_map_reader(DISTORT), "push $render"),
+            *(_map_reader(shot, DISTORT), "push $render"),
             _stmap("Distort"),
             "push $plate",
             _node("Merge2", inputs=2, name="PointsOnPlate"),
@@ -128,14 +128,14 @@ def _plate(shot: Shot, footage: Path | Sequence | None) -> str:
 
 
 def _camera(shot: Shot) -> str:
-    lens = shot.lens
+    lens, focal = shot.lens, np.array([lens.focal_length for lens in shot.lenses])
     return _node(
         "Camera2",
         inputs=0,
         rot_order="ZXY",
         translate=_curves(shot.numbers, shot.world_from_film[:, :3, 3]),
         rotate=_curves(shot.numbers, angles_zxy(shot.world_from_film[:, :3, :3])),
-        focal=_number(lens.focal_length),
+        focal=_curves(shot.numbers, focal[:, None]) if shot.zooms else _number(lens.focal_length),
         haperture=_number(lens.sensor_width),
         vaperture=_number(lens.sensor_height),
         near=_number(shot.clipping[0]),
@@ -151,9 +151,10 @@ def _window_translation(lens: Lens) -> tuple[float, float]:
     return 2 * lens.right / lens.sensor_width, 2 * lens.up / lens.sensor_width
 
 
-def _map_reader(name: str) -> str:
-    file, title = f'"{_BESIDE_SCRIPT}{name}"', f"Map_{Path(name).stem}"
-    return _node("Read", inputs=0, file_type="exr", file=file, raw="true", name=title)
+def _map_reader(shot: Shot, name: str) -> str:
+    number, frames = (".%04d", {"first": shot.numbers[0], "last": shot.numbers[-1]}) if shot.zooms else ("", {})
+    file = f'"{_BESIDE_SCRIPT}{name}{number}.exr"'
+    return _node("Read", inputs=0, file_type="exr", file=file, **frames, raw="true", name=f"Map_{name}")
 
 
 def _stmap(name: str) -> str:

@@ -11,9 +11,17 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.camera import PIXEL_CENTER
+from factorsfm.camera import PIXEL_CENTER, camera_from_json
 from factorsfm.errors import InputError
-from factorsfm.reconstruction import FrameResult, FrameStatus, PriorFit, Reconstruction, ShotKind
+from factorsfm.reconstruction import (
+    ControlFit,
+    ControlResidual,
+    FrameResult,
+    FrameStatus,
+    PriorFit,
+    Reconstruction,
+    ShotKind,
+)
 from factorsfm.summary import PROGRAM, part_name
 
 
@@ -55,14 +63,12 @@ def _summary(directory: Path) -> dict[str, Any]:
 
 def _reconstruction(content: dict[str, Any], model: pycolmap.Reconstruction) -> Reconstruction:
     images = {image_id - 1: image for image_id, image in model.images.items()}
-    frames = [_frame(status, images) for status in content["statuses"]]
+    own = len(model.cameras) > 1
+    frames = [_frame(status, images, own=own) for status in content["statuses"]]
     point_ids = sorted(model.points3D)
     row_of_point = {point_id: row for row, point_id in enumerate(point_ids)}
     points = [model.points3D[point_id] for point_id in point_ids]
-    camera = model.cameras[1]
-    for frame in frames:
-        if frame.cam_from_world is not None and images[frame.index].camera_id != 1:
-            frame.camera = model.cameras[images[frame.index].camera_id]
+    camera = camera_from_json(content["camera"]) if own else _copy(next(iter(model.cameras.values())))
 
     frame_of, point_of, xy, error = [], [], [np.empty((0, 2))], [np.empty(0)]
     for position, frame in enumerate(frames):
@@ -92,13 +98,15 @@ def _reconstruction(content: dict[str, Any], model: pycolmap.Reconstruction) -> 
         kind=ShotKind(content["kind"]),
         parallax=_number(content["parallax"]),
         metric=content["metric"],
+        control=_control(content["control"]),
         notes=content["notes"],
         seconds=content["seconds"],
         options=content["options"],
     )
 
 
-def _frame(status: dict[str, Any], images: dict[int, pycolmap.Image]) -> FrameResult:
+def _frame(status: dict[str, Any], images: dict[int, pycolmap.Image], *, own: bool) -> FrameResult:
+    """`own`: whether the frames have lenses of their own."""
     prior = status["prior"]
     return FrameResult(
         index=status["index"],
@@ -112,7 +120,17 @@ def _frame(status: dict[str, Any], images: dict[int, pycolmap.Image]) -> FrameRe
         inliers=status["inliers"],
         reprojection_error=_number(status["reprojection_error"]),
         prior=prior and PriorFit(**{name: _number(value) for name, value in prior.items()}),
+        camera=_copy(images[status["index"]].camera) if own and status["registered"] else None,
+        focal_std=status.get("focal_std"),
     )
+
+
+def _control(content: dict[str, Any] | None) -> ControlFit | None:
+    if content is None:
+        return None
+    residuals = [ControlResidual(**residual) for residual in content["residuals"]]
+    stds = _number(content["scale_std"]), _number(content["position_std"])
+    return ControlFit(residuals, content["held"], content["unused"], content["placed"], *stds)
 
 
 def _number(value: float | None) -> float:
@@ -121,3 +139,8 @@ def _number(value: float | None) -> float:
 
 def _joined(parts: list[NDArray[np.float64]]) -> NDArray[np.float64]:
     return np.concatenate(parts)
+
+
+def _copy(camera: pycolmap.Camera) -> pycolmap.Camera:
+    """A camera that outlives its model."""
+    return pycolmap.Camera(camera.todict())

@@ -147,7 +147,20 @@ class Shot:
 
     @cached_property
     def lens(self) -> Lens:
-        camera = self.reconstruction.camera
+        """The lens of the shot."""
+        return self._pinhole(self.reconstruction.camera)
+
+    @cached_property
+    def lenses(self) -> list[Lens]:
+        """The lens of each registered frame."""
+        return [self._pinhole(self.reconstruction.camera_of(frame)) for frame in self.reconstruction.registered]
+
+    @property
+    def zooms(self) -> bool:
+        """Whether the registered frames have lenses of their own."""
+        return self.reconstruction.has_own_lenses
+
+    def _pinhole(self, camera: pycolmap.Camera) -> Lens:
         return Lens(
             width=camera.width,
             height=camera.height,

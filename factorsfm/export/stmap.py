@@ -17,7 +17,7 @@ from factorsfm.frames import read_frames
 
 Array = NDArray[np.float64]
 
-UNDISTORT, DISTORT = "undistort.exr", "distort.exr"
+UNDISTORT, DISTORT = "undistort", "distort"
 
 _NOWHERE = -1.0  # outside of every image
 _SAME = 1e-3  # pixels; two points closer than that are one
@@ -30,21 +30,22 @@ def write_stmaps(shot: Shot, folder: Path) -> None:
     changes nothing holds ``(column + 0.5) / width`` and ``1 - (row + 0.5) / height``, rows counted from the top. Blue
     is 0. `undistort.exr` makes footage straight, `distort.exr` bends a render to fit the footage. Size, focal length
     and principal point are the same before and after, so the exported camera fits the straight footage as it is. Where
-    there is nothing to look at, both hold -1.
+    there is nothing to look at, both hold -1. A lens that zooms has a pair for each registered frame, which carry its
+    number: ``undistort.1001.exr``.
 
     Raises:
         InputError: the package that writes EXR files is missing.
     """
-    camera = shot.reconstruction.camera
-    _write_exr(folder / UNDISTORT, _stmap(_distorted_places(camera), camera))
-    _write_exr(folder / DISTORT, _stmap(_undistorted_places(camera), camera))
+    for suffix, camera in _cameras(shot):
+        _write_exr(folder / f"{UNDISTORT}{suffix}.exr", _stmap(_distorted_places(camera), camera))
+        _write_exr(folder / f"{DISTORT}{suffix}.exr", _stmap(_undistorted_places(camera), camera))
 
 
 def write_undistorted(shot: Shot, folder: Path) -> None:
     """Write every frame of the footage without distortion, as ``plate.NUMBER.png``; 8 bits per channel, cubic.
 
     Also the frames that are not registered, and those outside of the range that was reconstructed: the plates take
-    the footage's place as it is.
+    the footage's place as it is. Where a lens zooms, these are taken with that of the frame before.
 
     Raises:
         InputError: there is no footage, or it has another size than the camera.
@@ -52,18 +53,34 @@ def write_undistorted(shot: Shot, folder: Path) -> None:
     camera = shot.reconstruction.camera
     if shot.footage is None:
         raise InputError("there is no footage to undistort; name a video file or a folder of images")
-    places = np.nan_to_num(_distorted_places(camera), nan=-max(camera.width, camera.height)) - PIXEL_CENTER
-    x, y = np.moveaxis(places, -1, 0).astype(np.float32)
+    own = {frame.index: frame.camera for frame in shot.reconstruction.frames if frame.camera is not None}
+    x, y = _straightening(camera)
     for frame in read_frames(shot.footage):
         height, width = frame.image.shape[:2]
         if (width, height) != (camera.width, camera.height):
             raise InputError(
                 f"the footage {shot.footage} has {width}x{height} pixels, the camera {camera.width}x{camera.height}"
             )
+        if frame.index in own:
+            x, y = _straightening(own[frame.index])
         plate = cv2.remap(frame.image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)
         name = f"plate.{shot.first_frame + frame.index:04d}.png"
         if not cv2.imwrite(str(folder / name), plate):
             raise OSError(f"the image {name} cannot be written")
+
+
+def _cameras(shot: Shot) -> list[tuple[str, pycolmap.Camera]]:
+    """The lenses, and what their maps have in their names."""
+    if not shot.zooms:
+        return [("", shot.reconstruction.camera)]
+    registered = zip(shot.numbers, shot.reconstruction.registered, strict=True)
+    return [(f".{number:04d}", shot.reconstruction.camera_of(frame)) for number, frame in registered]
+
+
+def _straightening(camera: pycolmap.Camera) -> NDArray[np.float32]:
+    """(2, h, w) x and y where the pixels of the undistorted image are found; centres at integers."""
+    places = np.nan_to_num(_distorted_places(camera), nan=-max(camera.width, camera.height)) - PIXEL_CENTER
+    return np.asarray(np.moveaxis(places, -1, 0), np.float32)
 
 
 def _distorted_places(camera: pycolmap.Camera) -> Array:

@@ -50,7 +50,10 @@ def write_usd(shot: Shot, path: Path) -> None:
     camera.CreateVerticalApertureAttr(tenths_per_mm * lens.sensor_height)
     camera.CreateHorizontalApertureOffsetAttr(tenths_per_mm * lens.right)
     camera.CreateVerticalApertureOffsetAttr(tenths_per_mm * lens.up)
-    camera.CreateFocalLengthAttr(tenths_per_mm * lens.focal_length)
+    focal_length = camera.CreateFocalLengthAttr(tenths_per_mm * lens.focal_length)
+    if shot.zooms:
+        for number, own in zip(shot.numbers, shot.lenses, strict=True):
+            focal_length.Set(tenths_per_mm * own.focal_length, number)
     camera.CreateClippingRangeAttr(gf.Vec2f(*shot.clipping))
     transform = camera.AddTransformOp()
     for number, matrix in zip(shot.numbers, shot.world_from_film, strict=True):

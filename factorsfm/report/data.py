@@ -32,7 +32,7 @@ def reconstruction_data(reconstruction: Reconstruction) -> dict[str, Any]:
         "unit": unit,
         "width": camera.width,
         "height": camera.height,
-        "focal": camera.focal_length_x,
+        "focals": [reconstruction.camera_of(frame).focal_length_x for frame in reconstruction.registered],
         "points": _base64(view.points, "<f4"),
         "colors": _base64(view.colors, "u1"),
         "centers": _base64(view.centers, "<f4"),

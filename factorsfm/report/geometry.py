@@ -82,9 +82,10 @@ def tracks(reconstruction: Reconstruction, view: Scene, max_observations: int) -
     solved = np.empty((len(kept), 2))
     for k in np.unique(position):
         mine = position == k
-        frame = reconstruction.frames[k]
-        in_camera = frame.cam_from_world * reconstruction.points[reconstruction.observation_point[kept[mine]]]
-        solved[mine] = reconstruction.camera_of(frame).img_from_cam(in_camera) - PIXEL_CENTER
+        pose = reconstruction.frames[k].cam_from_world
+        in_camera = pose * reconstruction.points[reconstruction.observation_point[kept[mine]]]
+        camera = reconstruction.camera_of(reconstruction.frames[k])
+        solved[mine] = camera.img_from_cam(in_camera) - PIXEL_CENTER
     return Tracks(position, point[kept], xy, solved - xy, reconstruction.prior_residual[kept])
 
 

@@ -51,15 +51,22 @@ class Projector:
 
     @staticmethod
     def of(reconstruction: Reconstruction) -> Projector:
+        distance = np.linalg.norm(reconstruction.points - reconstruction.camera_centers()[0], axis=1)
         camera = reconstruction.camera
+        return Projector(camera, Projector._limit(camera), 0.02 * float(np.nanmedian(distance)))
+
+    def through(self, camera: pycolmap.Camera) -> Projector:
+        """The same with another lens."""
+        return self if camera is self.camera else Projector(camera, self._limit(camera), self.near)
+
+    @staticmethod
+    def _limit(camera: pycolmap.Camera) -> Array:
         w, h = camera.width, camera.height
         border = np.array([[0, 0], [w / 2, 0], [w, 0], [w, h / 2], [w, h], [w / 2, h], [0, h], [0, h / 2]])
         rays = np.abs(np.asarray(camera.cam_from_img(border)).reshape(-1, 2))
         known = rays[np.isfinite(rays).all(axis=1)]  # a lens model may have no inverse in the corners
         pinhole = np.array([w / camera.focal_length_x, h / camera.focal_length_y]) / 2
-        limit = _MARGIN * np.maximum(known.max(axis=0) if len(known) else pinhole, pinhole)
-        distance = np.linalg.norm(reconstruction.points - reconstruction.camera_centers()[0], axis=1)
-        return Projector(camera, limit, 0.02 * float(np.nanmedian(distance)))
+        return np.asarray(_MARGIN * np.maximum(known.max(axis=0) if len(known) else pinhole, pinhole))
 
     def __call__(self, cam_from_world: pycolmap.Rigid3d, points: Array) -> Array:
         """(..., 2) pixels of (..., 3) points, NaN where they are not in or near the view."""
@@ -141,7 +148,7 @@ def draw_overlay(
         image: (h, w, 3) BGR.
     """
     frame = reconstruction.frames[position]
-    canvas = image.copy()
+    canvas, projector = image.copy(), projector.through(reconstruction.camera_of(frame))
     pose = frame.cam_from_world
     if pose is not None:
         if "grid" in layers:

@@ -20,7 +20,7 @@ from factorsfm.report.wording import (
     status_words,
     verdict_sentence,
 )
-from factorsfm.summary import PROGRAM, json_text, program_version, with_total
+from factorsfm.summary import PROGRAM, focal_range, json_text, program_version, with_total
 
 _SCRIPTS = ("base.js", "view.js", "footage.js", "charts.js", "page.js")
 _LIBRARIES = ("gtsam", "pycolmap", "opencv-python-headless", "onnxruntime", "numpy")
@@ -91,7 +91,7 @@ def _document(
 
 
 def _facts(reconstruction: Reconstruction) -> dict[str, Any]:
-    camera = reconstruction.camera
+    camera, focals = reconstruction.camera, focal_range(reconstruction)
     return {
         "Frames solved": f"{len(reconstruction.registered)} / {len(reconstruction.frames)}",
         "Keyframes": sum(frame.keyframe for frame in reconstruction.frames),
@@ -100,7 +100,7 @@ def _facts(reconstruction: Reconstruction) -> dict[str, Any]:
         "Parallax": f"{reconstruction.parallax:.3f}",
         "Motion": reconstruction.kind,
         "Scale": "metres" if reconstruction.metric else "free",
-        "Focal length": f"{camera.mean_focal_length():.1f} px",
+        "Focal length": f"{focals[0]:.1f} to {focals[1]:.1f} px" if focals else f"{camera.mean_focal_length():.1f} px",
         "Lens": f"{camera.model_name} {camera.width}×{camera.height}",
     }
 

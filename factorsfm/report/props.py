@@ -193,8 +193,8 @@ def _with_axes(
 
 def _spread(reconstruction: Reconstruction, plane: Plane) -> Array:
     """(n, 2) coordinates on the plane of supporting points that are well inside the middle picture and far apart."""
-    camera = reconstruction.camera
     poses = [frame.cam_from_world for frame in reconstruction.frames if frame.cam_from_world is not None]
+    camera = reconstruction.camera_of(reconstruction.registered[len(poses) // 2])
     points = reconstruction.points[plane.support]
     flat = (points - plane.origin) @ plane.axes[:2].T
     inner = (flat >= plane.extent[0]).all(axis=1) & (flat <= plane.extent[1]).all(axis=1)

@@ -58,7 +58,7 @@ function viewer(width, height) {
     return {
       axes: [0, 1, 2].map(column => [r[column], r[3 + column], r[6 + column]]),
       eye: centers.subarray(3 * row, 3 * row + 3),
-      focal: data.focal * Math.min(width / data.width, height / data.height),
+      focal: data.focals[row] * Math.min(width / data.width, height / data.height),
       near: 1e-6 * sceneSize,
       inside: true,
     };
@@ -132,7 +132,7 @@ function drawScene() {
     if (row === undefined) continue;
     const shown = row === current, reach = (shown ? 0.13 : 0.07) * scene.distance;
     const r = rotations.subarray(9 * row, 9 * row + 9), c = centers.subarray(3 * row, 3 * row + 3);
-    const w = data.width / 2 / data.focal, h = data.height / 2 / data.focal;
+    const w = data.width / 2 / data.focals[row], h = data.height / 2 / data.focals[row];
     const corners = [[-w, -h], [w, -h], [w, h], [-w, h]].map(([x, y]) => project([0, 1, 2].map(a => c[a] + reach * (r[3 * a] * x + r[3 * a + 1] * y + r[3 * a + 2]))));
     context.lineWidth = (shown ? 1.8 : 1) * ratio;
     context.beginPath();
