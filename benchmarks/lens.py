@@ -2,7 +2,7 @@
 
     python -m benchmarks.lens --data FOLDER --models FOLDER
 
-FOLDER/studiosim holds the shots with their truth (`benchmarks.inputs`).
+FOLDER/studiosim and FOLDER/real hold the shots with their truth (`benchmarks.inputs`).
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def main() -> None:
     parser.add_argument("--shots", nargs="+", default=[f"d{k:02d}" for k in range(1, 11)], help="beginnings of names")
     arguments = parser.parse_args()
     depth = factorsfm.DepthModel(arguments.models / NETWORK_FILES["tcmonodepth"])
-    folders = [f for f in sorted((arguments.data / "studiosim").iterdir()) if f.name[:3] in arguments.shots]
+    folders = [f for f in sorted(arguments.data.glob("*/*")) if f.name.startswith(tuple(arguments.shots))]
     rows = []
     for folder in folders:
         shot = read_shot(folder)

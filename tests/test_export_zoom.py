@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +12,11 @@ from export_problems import hard_reconstruction, noise_images, numbers
 from test_export_formats import after_effects_tracks, nuke_curves, nuke_nodes
 
 from factorsfm.camera import with_focal
+from factorsfm.errors import InputError
 from factorsfm.explicit_graph import factor_graph
 from factorsfm.export import ExportOptions, export
-from factorsfm.reconstruction import Reconstruction
+from factorsfm.extension import add_images
+from factorsfm.reconstruction import Reconstruction, ShotKind
 from factorsfm.report.data import reconstruction_data
 from factorsfm.report.overlay import Projector
 from factorsfm.report.page import report_html
@@ -142,3 +145,9 @@ def test_graph_report_and_overlay_see_through_the_lens_of_the_frame() -> None:
     fixed, _ = factor_graph(hard_reconstruction("PINHOLE"))
     assert graph.size() == fixed.size()
     assert graph.error(values) != pytest.approx(fixed.error(values))
+
+
+def test_no_images_are_added_to_a_zoom() -> None:
+    reconstruction, _ = zooming()
+    with pytest.raises(InputError, match="this one zooms"):
+        add_images(replace(reconstruction, kind=ShotKind.GENERAL), [])
