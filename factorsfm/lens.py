@@ -103,12 +103,17 @@ def through(state: State, focal: Array) -> State:
 
 
 def estimate_lens(
-    adjustment: BundleAdjustment, guess: Lens, options: Options, focal_prior: tuple[Array, Array] | None = None
+    adjustment: BundleAdjustment,
+    guess: Lens,
+    options: Options,
+    focal_prior: tuple[Array, Array] | None = None,
+    fallback: Array | None = None,
 ) -> tuple[BundleAdjustment, LensEstimate]:
-    """The lens where the shot determines it, else the guess; and the cameras with it.
+    """The lens where the shot determines it, else what was thought first; and the cameras with it.
 
     Args:
         adjustment: converged with the guess; focal_prior: as in `BundleAdjustment`.
+        fallback: (g,) focal lengths that are kept where the shot determines none, pixels; None: those of the guess.
 
     Returns:
         The adjustment with undistorted observations, whose `observations` are those of the lens.
@@ -151,7 +156,15 @@ def estimate_lens(
     misfit = best.sigma if best.sigma > _MISFIT * o.doubtful_px else 0.0
     far = np.abs(np.log(lens.focal / guess.focal)).max() > np.log(_LARGEST_RATIO)
     if misfit or far or not focal_std.max() < FOCAL_STD:
-        return adjustment, LensEstimate(guess, guess, focal_std, np.full(4, np.nan), misfit, False)
+        kept = Lens(guess.focal if fallback is None else fallback, guess.shape)
+        adjustment = BundleAdjustment(
+            through(adjustment.state, kept.focal),
+            renormalized(adjustment.observations, guess, kept, group),
+            options.polish,
+            sigma=adjustment.sigma,
+        )
+        adjustment.solve()
+        return adjustment, LensEstimate(guess, kept, focal_std, np.full(4, np.nan), misfit, False)
     state = best.state if moves else through(start, lens.focal)
     settled = BundleAdjustment(
         replace(state, lens=np.zeros(4)), best.observations, options.polish, sigma=best.sigma

@@ -38,6 +38,7 @@ _ALIKE = 20.0  # tracks that count as one: the errors of neighbours are alike
 _LENS_KEYFRAMES = 6  # from which an unknown focal length is estimated
 _LENS_ITERATIONS = 6
 _LENS_STD = 0.01  # relative, with which an estimate is better than a guess; a young map can be wrong as a whole
+_LENS_SIGMA_PX = 0.3  # standard deviation of the errors above which what they say of the lens is chance
 _LARGEST_LENS_STEP = 0.5  # of the logarithm of the focal length
 _FARTHEST = 1e-6  # smallest inverse distance of a point
 
@@ -116,7 +117,9 @@ def update_map(copy: MapCopy, graph: FactorGraph, read_depth: Callable[[], Image
 
 
 def _better_focal(adjustment: BundleAdjustment, held: NDArray[np.bool_]) -> float | None:
-    """Solve for the focal length, too; None where the map does not determine it yet."""
+    """Solve for the focal length, too; None where the map does not determine it yet, or fits no focal length."""
+    if adjustment.sigma > _LENS_SIGMA_PX:
+        return None
     free = BundleAdjustment(
         adjustment.state, adjustment.observations, _SOLVER,
         sigma=adjustment.sigma, free_focal=True, fixed=held, prior=adjustment.prior,

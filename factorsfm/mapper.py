@@ -30,7 +30,7 @@ Index = NDArray[np.int64]
 logger = logging.getLogger(__name__)
 
 _STATE = (
-    "focal", "keyframes", "new_points", "parallax", "started", "_waits_for_depth", "_due",
+    "focal", "first_focal", "keyframes", "new_points", "parallax", "started", "_waits_for_depth", "_due",
 )  # fmt: skip
 _DEPTH_PATIENCE = 3  # keyframes without a depth map after which one does without
 _YOUNG_ERROR = 0.8  # relative, of a map that only the prior has shaped; falls with the square of the keyframes
@@ -54,7 +54,7 @@ class Mapper:
 
     def __init__(self, focal: float, width: int, options: Options, *, has_prior: bool) -> None:
         self.options = options.mapper
-        self.focal = focal
+        self.focal, self.first_focal = focal, focal
         self.width = width
         self._refine_focal = options.refine_focal_length
         self.images: list[MappedImage] = []

@@ -79,6 +79,7 @@ def polish(
     shape: Array | None = None,
     groups: Index | None = None,
     control: LocatedControl | None = None,
+    first_focal: Array | None = None,
 ) -> Polished:
     """Triangulate all tracks and minimise over all registered frames.
 
@@ -87,6 +88,8 @@ def polish(
         focal: (g,) focal lengths, pixels; first guesses where the options refine them.
         shape: (4,) distortion of the lens as in `factors.distort` where the options refine the lens; None is none.
         groups: (images,) which of the focal lengths is that of each image; None: all have the first.
+        first_focal: (g,) what was thought of the focal lengths first, to which they return where the shot does not
+            determine them; None: `focal`.
         control: what is known beforehand, its marks normalised as the tracks are; it takes part at the end, and only
             where the camera moves.
 
@@ -108,7 +111,7 @@ def polish(
     lens = None
     if options.refine_focal_length:
         guess = Lens(focal, np.zeros(4) if shape is None else shape)
-        adjustment, lens = _estimate_lens(adjustment, guess, frames, options)
+        adjustment, lens = _estimate_lens(adjustment, guess, frames, options, first_focal)
         few, group = adjustment.observations, adjustment.state.group
         observations = lens.renormalize(observations, group)
         if control is not None:
@@ -194,14 +197,14 @@ def _put_under_control(result: Polished, adjustment: BundleAdjustment, control: 
 
 
 def _estimate_lens(
-    adjustment: BundleAdjustment, guess: Lens, frames: list[int], options: Options
+    adjustment: BundleAdjustment, guess: Lens, frames: list[int], options: Options, fallback: Array | None
 ) -> tuple[BundleAdjustment, LensEstimate]:
     """As `estimate_lens`, with a focal length for every frame where a zoom is asked for and found."""
     zoom = None
     if options.lens == "zoom" and len(guess.focal) == 1:
         zoom = find_zoom(adjustment, guess, np.array(frames, np.float64), options.polish)
     if zoom is None or not zoom.found:
-        adjustment, lens = estimate_lens(adjustment, guess, options)
+        adjustment, lens = estimate_lens(adjustment, guess, options, fallback=fallback)
         return adjustment, replace(lens, zoom_std=zoom.std if zoom else None)
     zoomed = Lens(np.exp(zoom.adjustment.state.log_focal), guess.shape)
     prior = np.zeros(len(frames)), zoom.information

@@ -267,6 +267,7 @@ class Stream(Closing):
                 lambda stage: progress(stage, 0, None) if progress else None,
                 lens_shape(self.camera) if self.options.refine_focal_length else None,
                 control=control,
+                first_focal=np.array([mapper.first_focal]),
             )
         reconstruction = assemble(
             result,

@@ -66,6 +66,7 @@ def test_reconstruct_writes_the_result(
         "control": None,
         "preset": "default",
         "unordered": None,
+        "features": "sift",
         "work": None,
     }
     captured = capsys.readouterr()
