@@ -34,7 +34,7 @@ _STATE = (
 )  # fmt: skip
 _DEPTH_PATIENCE = 3  # keyframes without a depth map after which one does without
 _YOUNG_ERROR = 0.8  # relative, of a map that only the prior has shaped; falls with the square of the keyframes
-_LEAST_RELOCALIZED = 0.3  # of the similar corners must agree with the pose
+_LEAST_RELOCALIZED = 0.7  # of the similar corners must agree with the pose; in a whole view nine tenths do
 _NOT_JOINED = (FrameStatus.LOST, FrameStatus.TOO_FEW_INLIERS)
 _PATIENCE, _YOUNG_KEYFRAMES = 5, 2  # images that do not join a map, and its keyframes, with which it is given up
 _RUNNING_OUT = 0.5  # share of an image's tracks with a point, below which the map is extended at once
