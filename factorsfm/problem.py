@@ -26,6 +26,11 @@ class Observations:
     point: Index
     xy: Array
 
+    def of(self, points: Index) -> Observations:
+        """Those of some points (ascending), renumbered."""
+        keep = np.isin(self.point, points)
+        return Observations(self.frame[keep], np.searchsorted(points, self.point[keep]), self.xy[keep])
+
 
 @dataclass(frozen=True, slots=True)
 class PriorObservations:

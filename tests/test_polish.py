@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from estimation_problems import angles_between, in_unit_of, make_problem
 
+from factorsfm.converge import in_front
 from factorsfm.images import MappedImage
 from factorsfm.initialization import ImageTracks
 from factorsfm.options import Options
-from factorsfm.polish import in_front, polish
+from factorsfm.polish import polish
 from factorsfm.reconstruction import FrameStatus, ShotKind
 
 
