@@ -62,7 +62,6 @@ class FactorGraph:
         self,
         adjustment: BundleAdjustment,
         positions: Sequence[int],
-        held: Sequence[bool],
         guided: Sequence[int],
         iterations: int,
     ) -> UpdateResult:
@@ -70,16 +69,18 @@ class FactorGraph:
 
         Args:
             adjustment: the problem of the window.
-            positions, held: identity of each of its frames, and which of them are constant.
+            positions: identity of each of its frames; those that it holds are constant.
             guided: positions of the frames that carry a depth prior, in the order of their affines.
             iterations: steps at most.
         """
-        free = [(row, p) for row, (p, constant) in enumerate(zip(positions, held, strict=True)) if not constant]
+        free = [(row, p) for row, p in enumerate(positions) if not adjustment.held[row]]
         trial = _Trial(gtsam.ISAM2(self._isam), self._slots, free, guided)
         before, covariance = adjustment.state, {}
         try:
-            adjustment.solve(iterations, trial.step)
-            reason = _fault(adjustment)
+            reason = "the keyframe observes no landmark" if adjustment.held[-1] else ""
+            if not reason:
+                adjustment.solve(iterations, trial.step)
+                reason = _fault(adjustment)
             if not reason:
                 trial.step(adjustment.state, *adjustment.condensed())  # the covariances are those without damping
                 covariance = {p: np.asarray(trial.isam.marginalCovariance(X(p))) for _, p in free}
@@ -157,8 +158,6 @@ def _fault(adjustment: BundleAdjustment) -> str:
     if not (np.isfinite(state.rotation).all() and np.isfinite(state.translation).all()):
         return "the pose is not finite"
     mine = o.frame == newest
-    if not mine.any():
-        return "the keyframe observes no landmark"
     depth = state.camera_points(o.frame[mine], o.point[mine])[:, 2]
     front = depth > 1e-6
     if front.mean() < _LEAST_IN_FRONT:

@@ -109,7 +109,7 @@ def update_map(copy: MapCopy, graph: FactorGraph, read_depth: Callable[[], Image
     guided = [positions[row] for row in rows]
     # A young map has the shape that the prior guessed, and far to go; it is also cheap.
     iterations = max(o.graph_iterations, _YOUNG_ITERATIONS // len(copy.keyframes))
-    result = graph.update(adjustment, positions, held.tolist(), guided, iterations)
+    result = graph.update(adjustment, positions, guided, iterations)
     if not result.committed:
         return MapUpdate(position, depth, False, result.reason)
     focal = _better_focal(adjustment, held) if copy.refine_focal and len(copy.keyframes) >= _LENS_KEYFRAMES else None

@@ -94,8 +94,8 @@ class BundleAdjustment:
         self._columns = self._control + len(state.control)
         free = np.ones(self._columns, bool)
         held = np.arange(frames) == 0 if fixed is None else fixed
-        held = held | (np.bincount(observations.frame, minlength=frames) == 0)  # nothing says where they are
-        free[: self._lens] = np.repeat(~held, 6)
+        self.held = held | (np.bincount(observations.frame, minlength=frames) == 0)  # nothing says where they are
+        free[: self._lens] = np.repeat(~self.held, 6)
         free[self._lens : self._shape] = free_focal
         if lens_sigmas is not None:
             free[self._shape : self._affine] = lens_sigmas > 0

@@ -59,13 +59,13 @@ class Shot:
         weighed = WeighedPrior(GOOD_PRIOR, np.array(guided), scale, shift, 1.0)
         return joint_problem(state, o, ids, window, weighed, SIGMA, options, fixed)[0], guided
 
-    def solve(self, adjustment, frames, guided, *, held=1, iterations=15):
-        return self.graph.update(adjustment, list(frames), [k < held for k in range(len(frames))], guided, iterations)
+    def solve(self, adjustment, frames, guided, *, iterations=15):
+        return self.graph.update(adjustment, list(frames), guided, iterations)
 
     def update(self, frames, *, held=1, **kwargs):
         """One update of the graph, kept if it is committed."""
         adjustment, guided = self.adjustment(frames, held=held)
-        result = self.solve(adjustment, frames, guided, held=held, **kwargs)
+        result = self.solve(adjustment, frames, guided, **kwargs)
         if result.committed:
             self.state = state = adjustment.state
             for row, k in enumerate(frames):
@@ -193,7 +193,7 @@ def test_covariances_are_those_of_the_dense_solver(guided):
     shot = Shot("handheld", noise_px=SIGMA, guided=guided)
     frames, held = range(FRAMES), 2  # two constant cameras: the unit of length is known
     adjustment, rows = shot.adjustment(frames, held=held)
-    result = shot.solve(adjustment, frames, rows, held=held)
+    result = shot.solve(adjustment, frames, rows)
     camera, _ = adjustment.covariance(np.zeros(0, np.int64))
     assert list(result.covariance) == list(frames[held:])
     for k, covariance in result.covariance.items():
@@ -207,7 +207,7 @@ def test_the_mappers_three_steps_give_covariances_roughly(guided):
     """They carry the damping of the last step."""
     shot = Shot("handheld", noise_px=SIGMA, guided=guided)
     adjustment, rows = shot.adjustment(range(FRAMES), held=2, options=PolishOptions(tolerance=1e-3))
-    result = shot.solve(adjustment, range(FRAMES), rows, held=2, iterations=3)
+    result = shot.solve(adjustment, range(FRAMES), rows, iterations=3)
     camera, _ = adjustment.covariance(np.zeros(0, np.int64))
     said = np.concatenate([np.diag(covariance) for covariance in result.covariance.values()])
     ratio = np.sqrt(said / np.diag(camera)[12 : 6 * FRAMES])
@@ -340,7 +340,7 @@ def test_a_solver_that_fails_is_no_update():
 def test_a_position_can_be_taken_only_once():
     shot = Shot("truck", guided=()).run(2)
     adjustment, _ = shot.adjustment(range(3))
-    result = shot.graph.update(adjustment, [0, 1, 1], [True, False, False], [], 3)
+    result = shot.graph.update(adjustment, [0, 1, 1], [], 3)
     assert not result.committed
     assert "already exists" in result.reason
     assert shot.variables() == {X(1)}

@@ -21,10 +21,10 @@ OPTIONS = MapperOptions(landmarks=200)
 class Recorder(FactorGraph):
     """A graph that remembers what it was asked for."""
 
-    def update(self, adjustment, positions, held, guided, iterations):
-        self.positions, self.held, self.guided = list(positions), list(held), list(guided)
+    def update(self, adjustment, positions, guided, iterations):
+        self.positions, self.held, self.guided = list(positions), adjustment.held.tolist(), list(guided)
         self.points, self.sigma, self.iterations = len(adjustment.state.bearing), adjustment.sigma, iterations
-        return super().update(adjustment, positions, held, guided, iterations)
+        return super().update(adjustment, positions, guided, iterations)
 
 
 def map_of(points, ids=None):
