@@ -35,6 +35,7 @@ _GEOMETRIC_DEG = 2.0  # median angle below which a start from depth is preferred
 _LEAST_ANGLE_DEG = 1.5  # between the rays of a new point; less where those of the whole map are small
 _LEAST_ANGLE_SHARE = 0.3  # of the median angle of the map
 _WORKING_TRACKS = (150, 1000, 60_000)  # per image while the map grows: at least, at most, and in the whole set
+_LEAST_FITTING, _MOST_CONTRADICTED = 0.5, 0.25  # shares of an image's observations, and of the images
 _GROWTH = 0.1  # of the number of images after which the map is adjusted
 _PYRAMID = (2, 4, 8, 16, 32)  # cells across, of the score by which the next image is chosen
 _SIGMA_PX = 0.5  # of keypoints, until it is measured
@@ -96,6 +97,8 @@ class SetMapper:
         self._common = _common_tracks(tracks)
         self._order: list[MappedImage] = []  # of registration; the first one is the world
         self._adjusted = 0
+        self._tried: dict[int, int] = {}  # by position: mapped tracks with which an image was tried last
+        self._released: Counter[int] = Counter()  # by position: how often an image was taken out of the map again
         self._held: set[int] = set()  # positions of the images whose poses are given
         self._angle = 0.0  # median angle between the rays of the latest points, degrees
 
@@ -179,15 +182,17 @@ class SetMapper:
         """Register one image after the other, on some of the tracks (ascending ids) or on all."""
         self._extend(working)
         self._adjust()
-        tried: dict[int, int] = {}
-        while (image := self._next(tried)) is not None:
-            if self._register(image):
-                self._extend(working, image)
-                if len(self._order) >= self._adjusted * (1.0 + _GROWTH):
-                    self._adjust()
-                    self._extend(working)
-        if len(self._order) > self._adjusted:
-            self._adjust()
+        self._tried.clear()
+        while True:
+            while (image := self._next()) is not None:
+                if self._register(image):
+                    self._extend(working, image)
+                    if len(self._order) >= self._adjusted * (1.0 + _GROWTH):
+                        self._adjust()
+                        self._extend(working)
+            if len(self._order) == self._adjusted:
+                return
+            self._adjust()  # images that it releases come next
             self._extend(working)
 
     # --- start --------------------------------------------------------------------------------------------------
@@ -247,6 +252,7 @@ class SetMapper:
         for image in self._order:
             image.rotation = image.translation = None
         self.points, self._order, self._adjusted = PointMap(), [], 0
+        self._released.clear()
         self._angle = _median_angle(start)
         self.points.set(start.ids, start.points)
         for position, rotation, translation in zip(start.images, start.rotation, start.translation, strict=True):
@@ -254,7 +260,7 @@ class SetMapper:
 
     # --- registration -------------------------------------------------------------------------------------------
 
-    def _next(self, tried: dict[int, int]) -> MappedImage | None:
+    def _next(self) -> MappedImage | None:
         """The image with most and best spread mapped tracks; one that failed waits until it sees more of the map."""
         best, best_score = None, 0
         for image in self.images:
@@ -262,13 +268,13 @@ class SetMapper:
                 continue
             mapped = self.points.contains(image.tracks.ids)
             n = int(mapped.sum())
-            if n < self.options.min_inliers or n < 1.2 * tried.get(image.tracks.position, 0):
+            if n < self.options.min_inliers or n < 1.2 * self._tried.get(image.tracks.position, 0):
                 continue
             score = _pyramid_score(image.tracks.xy, mapped)
             if score > best_score:
                 best, best_score = image, score
         if best is not None:
-            tried[best.tracks.position] = int(self.points.contains(best.tracks.ids).sum())
+            self._tried[best.tracks.position] = int(self.points.contains(best.tracks.ids).sum())
         return best
 
     def _register(self, image: MappedImage) -> bool:
@@ -351,11 +357,30 @@ class SetMapper:
         )  # fmt: skip
         for k, image in enumerate(self._order):
             image.rotation, image.translation = state.rotation[k], state.translation[k]
-        supported = np.bincount(observations.point, errors < _GOOD_PX, len(ids)) >= 2
+        fits = errors < _GOOD_PX
+        wrong = self._contradicted(observations.frame, fits)
+        supported = np.bincount(observations.point, fits & ~wrong[observations.frame], len(ids)) >= 2
         good = supported & (state.inverse_distance > 1e-6)
         self.points = PointMap()
         self.points.set(ids[good], state.points[good])
+        for image in (image for image, released in zip(self._order, wrong, strict=True) if released):
+            logger.debug("image %d is released: most of the map contradicts it", image.tracks.position)
+            image.forget(FrameStatus.WAITING, "most of the map contradicts its pose")
+            self._released[image.tracks.position] += 1
+            self._tried.pop(image.tracks.position, None)
+        self._order = [image for image in self._order if image.registered]
         self._adjusted = len(self._order)
+
+    def _contradicted(self, frame: Index, fits: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """(k,) images of which few observations fit, where nearly all others agree: a start before a plane makes such.
+
+        They are registered once more, on the map that the others have made.
+        """
+        count = len(self._order)
+        share = np.bincount(frame, fits, count) / np.maximum(np.bincount(frame, minlength=count), 1)
+        free = [i.tracks.position not in self._held and self._released[i.tracks.position] == 0 for i in self._order]
+        wrong = (share < _LEAST_FITTING) & np.array(free)
+        return wrong if wrong.sum() <= _MOST_CONTRADICTED * count else np.zeros(count, bool)
 
     def _set_focal(self, focal: float) -> None:
         renormalize(self.images, self.focal / focal)

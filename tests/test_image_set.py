@@ -107,6 +107,22 @@ def test_without_noise_the_solution_is_exact() -> None:
     assert ring.errors(result.state.rotation, result.state.translation).ate.max() < 1e-6
 
 
+def test_an_image_that_the_map_contradicts_is_registered_again() -> None:
+    ring = Ring()
+    mapper = SetMapper(ring.tracks(), FOCAL, _for_image_sets(Options()))
+    mapper.run()
+    spoiled, sound = mapper.images[3], mapper.images[3].pose
+    turn = cv2.Rodrigues(np.array([0.0, 0.6, 0.1]))[0]
+    spoiled.rotation, spoiled.translation = turn @ sound[0], turn @ sound[1] + [0.5, 0.0, 1.0]
+    mapper._adjustment = replace(mapper._adjustment, iterations=1)  # the others hold it where it is
+    mapper._adjust()
+    assert not spoiled.registered
+    assert "contradicts" in spoiled.message
+    mapper._grow(None)
+    assert registered(mapper) == list(range(len(mapper.images)))
+    assert np.linalg.norm(spoiled.pose[0] @ sound[0].T - np.eye(3)) < 0.01
+
+
 def test_the_part_with_most_images_is_kept_and_the_others_are_told_why() -> None:
     large, small, lonely = Ring(7), Ring(4, seed=1, first_id=5000), Ring(1, seed=2, first_id=9000)
     tracks = large.tracks() + small.tracks(first=7) + lonely.tracks(first=11)
