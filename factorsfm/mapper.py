@@ -261,10 +261,11 @@ class Mapper:
             depth_weight=o.depth_weight,
         )
         found = int(result.inliers.sum())
-        # More agree by chance within a threshold that is suddenly wider, as its area grows: what is seen may be
-        # something else. A young map is rough in every image.
-        by_chance = o.min_inliers * (result.threshold / near.threshold) ** 2
-        needed = math.ceil(max(o.min_inliers, min(by_chance, _CONSENSUS * near.inliers)))
+        # More agree by chance within a threshold that is suddenly wider, and what is seen may be something else: the
+        # more of its area is new, the more of the inliers before must still be there. A young map is always rough.
+        new_area = max(0.0, 1.0 - (near.threshold / result.threshold) ** 2)
+        most = max(o.min_inliers, _CONSENSUS * near.inliers)
+        needed = math.ceil(o.min_inliers + new_area**2 * (most - o.min_inliers))
         if found < needed:
             image.status = FrameStatus.TOO_FEW_INLIERS
             within = f"within {result.threshold:.1f} pixels among {mapped.sum()} mapped tracks"
