@@ -18,7 +18,7 @@ Index = NDArray[np.int64]
 logger = logging.getLogger(__name__)
 
 _FIRST_SIGMA_PX = 0.25
-_DOUBTFUL_INFLATION = 5.0  # sound solutions have 1 to 3.5
+_DOUBTFUL_INFLATION = 3.5  # sound solutions have 1 to 4; a doubt costs no more than time
 _CLEARLY = 0.9  # of the cost of the incremental map's solution, at which another start is preferred
 _CORE_TRACKS = 400  # tracks with which the cameras converge first
 
