@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.noise import coordinate_sigma, temporal_inflation
+from factorsfm.noise import FIRST_SIGMA_PX, coordinate_sigma, temporal_inflation
 from factorsfm.options import Options, PolishOptions
 from factorsfm.problem import Observations, State
 from factorsfm.refinement import BundleAdjustment
@@ -17,7 +17,6 @@ Index = NDArray[np.int64]
 
 logger = logging.getLogger(__name__)
 
-_FIRST_SIGMA_PX = 0.25
 _DOUBTFUL_INFLATION = 3.5  # sound solutions have 1 to 4; a doubt costs no more than time
 _CLEARLY = 0.9  # of the cost of the incremental map's solution, at which another start is preferred
 _CORE_TRACKS = 400  # tracks with which the cameras converge first
@@ -57,7 +56,7 @@ def _solve_core(part: State, few: Observations, options: Options) -> BundleAdjus
     """Converged from one start, first with a wide kernel."""
     o = options.polish
     errors = BundleAdjustment(part, few, o, sigma=1.0).reprojection_errors()
-    sigma = max(_FIRST_SIGMA_PX, coordinate_sigma(errors))
+    sigma = max(FIRST_SIGMA_PX, coordinate_sigma(errors))
     adjustment = BundleAdjustment(part, few, replace(o, iterations=20, tolerance=1e-3), sigma=sigma)
     adjustment.solve()
     sigma = min(sigma, coordinate_sigma(adjustment.reprojection_errors()))

@@ -9,6 +9,7 @@ from factorsfm.problem import Observations
 
 Array = NDArray[np.float64]
 
+FIRST_SIGMA_PX = 0.25  # of a tracked point, until it is measured
 SMALLEST_SIGMA_PX = 0.03  # no track is better than this
 _RAYLEIGH_MEDIAN = 1.1774  # median of the norm of a 2-D error, in standard deviations
 _BLOCKS = (8, 5, 16)  # across, down, frames: in which errors may be alike

@@ -16,7 +16,7 @@ from factorsfm.evaluation.alignment import Similarity
 from factorsfm.images import MappedImage, gather
 from factorsfm.lens import Lens, LensEstimate, estimate_lens, through
 from factorsfm.marginals import in_scene_unit
-from factorsfm.noise import SMALLEST_SIGMA_PX, block_inflation
+from factorsfm.noise import FIRST_SIGMA_PX, SMALLEST_SIGMA_PX, block_inflation
 from factorsfm.observability import Motion, camera_observability, classify_motion, pose_blocks
 from factorsfm.options import Options, PolishOptions
 from factorsfm.prior_term import PriorPart, joint_problem, weigh_prior
@@ -32,7 +32,6 @@ Index = NDArray[np.int64]
 
 logger = logging.getLogger(__name__)
 
-_FIRST_SIGMA_PX = 0.25
 _TRIANGULATION_VIEWS = 10
 
 
@@ -258,7 +257,7 @@ def _first_guess(
             some.of(new),
             focal=float(np.median(focal)),
             inlier_px=5.0,
-            sigma=_FIRST_SIGMA_PX,
+            sigma=FIRST_SIGMA_PX,
             fallback=np.ones(len(new)),
         )
         bearing[new], inverse[new] = result.bearing, result.inverse_distance

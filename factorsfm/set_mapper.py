@@ -98,7 +98,7 @@ class SetMapper:
         self._order: list[MappedImage] = []  # of registration; the first one is the world
         self._adjusted = 0
         self._tried: dict[int, int] = {}  # by position: mapped tracks with which an image was tried last
-        self._released: Counter[int] = Counter()  # by position: how often an image was taken out of the map again
+        self._released: set[int] = set()  # positions of images that were taken out of the map again, once each
         self._held: set[int] = set()  # positions of the images whose poses are given
         self._angle = 0.0  # median angle between the rays of the latest points, degrees
 
@@ -366,7 +366,7 @@ class SetMapper:
         for image in (image for image, released in zip(self._order, wrong, strict=True) if released):
             logger.debug("image %d is released: most of the map contradicts it", image.tracks.position)
             image.forget(FrameStatus.WAITING, "most of the map contradicts its pose")
-            self._released[image.tracks.position] += 1
+            self._released.add(image.tracks.position)
             self._tried.pop(image.tracks.position, None)
         self._order = [image for image in self._order if image.registered]
         self._adjusted = len(self._order)
@@ -378,8 +378,9 @@ class SetMapper:
         """
         count = len(self._order)
         share = np.bincount(frame, fits, count) / np.maximum(np.bincount(frame, minlength=count), 1)
-        free = [i.tracks.position not in self._held and self._released[i.tracks.position] == 0 for i in self._order]
-        wrong = (share < _LEAST_FITTING) & np.array(free)
+        settled = self._held | self._released
+        free = np.array([image.tracks.position not in settled for image in self._order])
+        wrong = (share < _LEAST_FITTING) & free
         return wrong if wrong.sum() <= _MOST_CONTRADICTED * count else np.zeros(count, bool)
 
     def _set_focal(self, focal: float) -> None:
