@@ -1,0 +1,24 @@
+"""Synthetic shots with exact truth: projected points, and a rendered room with video, depth and poses."""
+
+from factorsfm.synthetic.scene import Motion, SyntheticScene, room_camera, synthetic_scene
+from factorsfm.synthetic.shot import (
+    FRAMES_PER_SECOND,
+    RenderedShot,
+    render_shot,
+    render_views,
+    simulate_prior,
+    write_shot,
+)
+
+__all__ = [
+    "FRAMES_PER_SECOND",
+    "Motion",
+    "RenderedShot",
+    "SyntheticScene",
+    "render_shot",
+    "render_views",
+    "room_camera",
+    "simulate_prior",
+    "synthetic_scene",
+    "write_shot",
+]

@@ -1,0 +1,173 @@
+"""A textured room with boxes, met by rays: images and exact depth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from factorsfm.camera import PIXEL_CENTER
+from factorsfm.synthetic.scene import FIELD_OF_VIEW, Floats
+
+
+class Room:
+    """The room between 2 and 7 units in front of the identity; it has no wall behind it.
+
+    Args:
+        seed: of the boxes and their textures.
+        focal_length: pixels; the textures are about as fine as an image of it.
+    """
+
+    def __init__(self, seed: int, focal_length: float) -> None:
+        self._quads = _quads(np.random.default_rng(seed))
+        self._textures = [
+            _texture(np.random.default_rng([seed, i]), quad, focal_length) for i, quad in enumerate(self._quads)
+        ]
+
+    def depth(self, camera: pycolmap.Camera, pose: pycolmap.Rigid3d) -> Floats:
+        """(h, w) exact z-depth at the pixel centres, world units."""
+        return np.asarray(1 / _cast(self._quads, camera, pose, 1).inverse_depth, np.float64)
+
+    def image(self, camera: pycolmap.Camera, pose: pycolmap.Rigid3d) -> NDArray[np.uint8]:
+        """(h, w, 3) BGR, two by two samples per pixel, averaged."""
+        return _render(self._quads, self._textures, camera, pose)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Quad:
+    """The parallelogram origin + u * edges[0] + v * edges[1], u and v from 0 to 1, and its brightness."""
+
+    origin: Floats
+    edges: Floats
+    shade: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Hits:
+    """What the rays of an image hit: row in the list of quads, place on the quad (u, v), 1 / z."""
+
+    quad: NDArray[np.int16]
+    uv: NDArray[np.floating]
+    inverse_depth: NDArray[np.floating]
+
+
+def _quads(generator: np.random.Generator) -> list[_Quad]:
+    left, right, ceiling, floor, behind, back = -2.3, 2.3, -1.4, 1.1, -1.0, 7.0
+    x, y, z = np.diag([right - left, floor - ceiling, back - behind])
+    corner = np.array([left, ceiling, behind])
+    quads = [
+        _Quad(corner + y, np.array([x, z]), 0.9),
+        _Quad(corner, np.array([x, z]), 0.7),
+        _Quad(corner + z, np.array([x, y]), 1.0),
+        _Quad(corner, np.array([z, y]), 0.8),
+        _Quad(corner + x, np.array([z, y]), 0.75),
+    ]
+    for i, depth in enumerate(np.linspace(2.8, 6.2, 9)):  # standing on the floor, left and right in turn
+        size = generator.uniform([0.4, 0.6, 0.4], [0.8, 1.5, 0.8]) * [depth / 5, 1, depth / 5]
+        middle = (-1) ** i * generator.uniform(0.15, 0.6) * depth * np.tan(FIELD_OF_VIEW / 2)
+        quads += _box(generator, np.array([np.clip(middle, -1.7, 1.7), floor - size[1] / 2, depth]), size)
+    for depth in np.linspace(3.2, 5.7, 4):  # hanging from the ceiling
+        size = generator.uniform([0.3, 0.3, 0.3], [0.7, 0.7, 0.7])
+        middle = generator.uniform(-0.8, 0.8) * depth * np.tan(FIELD_OF_VIEW / 2)
+        quads += _box(generator, np.array([np.clip(middle, -1.7, 1.7), ceiling + size[1] / 2, depth]), size)
+    return quads
+
+
+def _box(generator: np.random.Generator, center: Floats, size: Floats) -> list[_Quad]:
+    """The six faces of a box that is turned about the vertical by up to 40 degrees."""
+    turn = np.radians(generator.uniform(-40, 40))
+    x, y, z = pycolmap.Rotation3d(np.array([0, turn, 0])).matrix().T * size[:, None]
+    corner = center - (x + y + z) / 2
+    faces = [(x, y, z, 0.9), (z, y, x, 0.7), (x, z, y, 1.0)]
+    return [
+        _Quad(corner + offset, np.array([u, v]), shade)
+        for u, v, across, shade in faces
+        for offset in (np.zeros(3), across)
+    ]
+
+
+def _cast(quads: list[_Quad], camera: pycolmap.Camera, pose: pycolmap.Rigid3d, oversampling: int) -> _Hits:
+    """Meet every pixel's ray with the nearest quad; exact, since u/z, v/z and 1/z are linear in the pixel."""
+    dtype = np.float64 if oversampling == 1 else np.float32  # depth is truth, colour is not
+    width, height = oversampling * camera.width, oversampling * camera.height
+    focal_length = oversampling * camera.focal_length_x
+    x = ((np.arange(width) + PIXEL_CENTER - width / 2) / focal_length).astype(dtype)
+    y = ((np.arange(height)[:, None] + PIXEL_CENTER - height / 2) / focal_length).astype(dtype)
+    hit_quad = np.full((height, width), -1, dtype=np.int16)
+    nearest = np.zeros((3, height, width), dtype=dtype)  # u/z, v/z, 1/z
+    for i, quad in enumerate(quads):
+        corners = pose * (quad.origin + np.array([[0, 0], [0, 1], [1, 0], [1, 1]]) @ quad.edges)
+        window = np.s_[:, :]
+        if corners[:, 2].min() > 0:
+            corner_x, corner_y = (corners[:, :2] / corners[:, 2:]).T
+            columns, rows = (
+                slice(*np.searchsorted(axis, [ends.min(), ends.max()]))
+                for axis, ends in ((x, corner_x), (y[:, 0], corner_y))
+            )
+            window = np.s_[rows, columns]
+        on_quad = np.linalg.inv(np.column_stack([pose.rotation.matrix() @ quad.edges.T, pose * quad.origin]))
+        u, v, w = (row[0] * x[window[1]] + (row[1] * y[window[0]] + row[2]) for row in on_quad.astype(dtype))
+        seam = 1e-6  # neighbours overlap by this much: no ray slips through a corner of the room
+        hit = (w > nearest[2][window]) & (u >= -seam) & (u <= w + seam) & (v >= -seam) & (v <= w + seam)
+        hit_quad[window][hit] = i
+        for old, new in zip(nearest, (u, v, w), strict=True):
+            old[window][hit] = new[hit]
+    return _Hits(hit_quad, nearest[:2] / nearest[2], nearest[2])
+
+
+def _render(
+    quads: list[_Quad], textures: list[NDArray[np.uint8]], camera: pycolmap.Camera, pose: pycolmap.Rigid3d
+) -> NDArray[np.uint8]:
+    hits = _cast(quads, camera, pose, 2)
+    image = np.zeros((*hits.quad.shape, 3), dtype=np.uint8)
+    for i in np.unique(hits.quad):
+        mask = (hits.quad == i).astype(np.uint8)
+        x, y, w, h = cv2.boundingRect(mask)
+        window = np.s_[y : y + h, x : x + w]
+        size = np.array(textures[i].shape[1::-1])[:, None, None]
+        map_x, map_y = (hits.uv[:, *window] * size - PIXEL_CENTER).astype(np.float32)
+        color = cv2.remap(textures[i], map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        cv2.copyTo(color, mask[window], image[window])
+    return np.asarray(cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def _texture(generator: np.random.Generator, quad: _Quad, focal_length: float) -> NDArray[np.uint8]:
+    """Bricks, blotches with sharp edges, noise of all sizes; about one texel per pixel of the first image."""
+    middle = quad.origin + quad.edges.sum(axis=0) / 2
+    length = np.linalg.norm(quad.edges, axis=1)
+    seen = np.linalg.norm(quad.edges[:, :2] - quad.edges[:, 2:] * middle[:2] / middle[2], axis=1)
+    width, height = np.clip(focal_length / middle[2] * np.maximum(seen, 0.3 * length), 16, 4096).astype(int)
+
+    first, second = generator.uniform(80, 180, (2, 1)) + generator.uniform(-30, 30, (2, 3))
+    blotches = np.clip(0.5 + 3 * _noise(generator, length, width, height, 0.6, 0.1), 0, 1)
+    texture = first + (second - first) * blotches[..., None]
+    texture += 25 * _noise(generator, length, width, height, 0.4, 0.0)[..., None]
+
+    brick = generator.uniform([0.3, 0.15], [0.6, 0.4])
+    u, v = (
+        (np.arange(n) + 0.5) / n * side / pitch for n, side, pitch in zip((width, height), length, brick, strict=True)
+    )
+    row = np.floor(v).astype(int)[:, None]
+    along = u[None, :] + 0.5 * (row % 2)
+    tint = generator.uniform(-25, 25, (int(row.max()) + 1, int(along.max()) + 1))
+    texture += tint[row, along.astype(int)][..., None]
+    mortar = (along % 1 < 0.02 / brick[0]) | (v % 1 < 0.02 / brick[1])[:, None]
+    texture[mortar] *= 0.55
+    return np.asarray(np.clip(quad.shade * texture, 0, 255), dtype=np.uint8)
+
+
+def _noise(
+    generator: np.random.Generator, length: Floats, width: int, height: int, coarsest: float, finest: float
+) -> Floats:
+    """Noise of zero mean and unit deviation; wavelengths in world units, at least three texels."""
+    total = np.zeros((height, width))
+    wavelength = coarsest
+    while wavelength >= max(finest, 3 * max(length[0] / width, length[1] / height)) or wavelength == coarsest:
+        cells = np.ceil(length / wavelength).astype(int) + 2
+        grid = generator.standard_normal((cells[1], cells[0]))
+        total += cv2.resize(grid, (width, height), interpolation=cv2.INTER_CUBIC)
+        wavelength /= 2
+    return np.asarray((total - total.mean()) / total.std())

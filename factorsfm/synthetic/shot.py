@@ -1,0 +1,165 @@
+"""A rendered shot with exact truth: images, depth and poses, with a prior as a network would give it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from factorsfm.camera import camera_to_json, with_focal
+from factorsfm.errors import InputError
+from factorsfm.synthetic.room import Room
+from factorsfm.synthetic.scene import Floats, Motion, camera_path, room_camera
+
+FRAMES_PER_SECOND = 24.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RenderedShot:
+    """A rendered room with exact truth.
+
+    Attributes:
+        images: (h, w, 3) uint8 BGR per frame.
+        depths: (h, w) float32 per frame: exact z-depth at the pixel centres, world units.
+        camera: the lens of the first frame.
+        cam_from_world: one pose per frame.
+        zoom: (k,) focal length of each frame, relative to the first one.
+    """
+
+    images: list[NDArray[np.uint8]]
+    depths: list[NDArray[np.float32]]
+    camera: pycolmap.Camera
+    cam_from_world: list[pycolmap.Rigid3d]
+    zoom: Floats
+
+
+def render_shot(
+    motion: Motion = "dolly",
+    frames: int = 30,
+    width: int = 480,
+    height: int = 270,
+    parallax: float = 0.05,
+    seed: int = 0,
+    zoom: float = 1.0,
+) -> RenderedShot:
+    """Render a textured room with boxes between 2 and 7 units in front of the camera.
+
+    Args:
+        motion: camera path; "rotation" and "static" do not translate.
+        frames: number of frames, at least 2.
+        width, height: pixels.
+        parallax: largest distance of a camera from the first one over the median depth of the first image,
+            exact; beyond about 0.3 the camera may run into a box.
+        seed: of the room, its textures and the handheld sway.
+        zoom: focal length of the last frame over that of the first; between them it changes softly.
+
+    Raises:
+        InputError: an unknown motion, fewer than 2 frames, a parallax outside 0 to 1, or a zoom that is not positive.
+    """
+    if not zoom > 0:
+        raise InputError(f"a synthetic shot with a zoom of {zoom:g} was asked for; it must be above 0")
+    camera = room_camera(width, height)
+    room = Room(seed, camera.focal_length_x)
+    depth = float(np.median(room.depth(camera, pycolmap.Rigid3d())))
+    path = camera_path(motion, frames, parallax, depth, seed)
+    time = np.linspace(0, 1, frames)
+    zooms = zoom ** (time**2 * (3 - 2 * time))
+    views = [
+        (with_focal(camera, camera.focal_length_x * factor), pose) for factor, pose in zip(zooms, path, strict=True)
+    ]
+    return RenderedShot(
+        images=[room.image(lens, pose) for lens, pose in views],
+        depths=[room.depth(lens, pose).astype(np.float32) for lens, pose in views],
+        camera=camera,
+        cam_from_world=path,
+        zoom=zooms,
+    )
+
+
+def render_views(
+    cam_from_world: Iterable[pycolmap.Rigid3d], width: int, height: int, seed: int = 0
+) -> Iterator[NDArray[np.uint8]]:
+    """The room of `render_shot` from any cameras in it, as (h, w, 3) BGR, one after the other.
+
+    Args:
+        cam_from_world: the cameras; the room has no wall behind that of the identity.
+        width, height, seed: see `render_shot`, whose lens it is.
+    """
+    camera = room_camera(width, height)
+    room = Room(seed, camera.focal_length_x)
+    for pose in cam_from_world:
+        yield room.image(camera, pose)
+
+
+def simulate_prior(shot: RenderedShot, error: float = 0.05, seed: int = 0) -> list[NDArray[np.float32]]:
+    """Inverse depth as a good network gives it: relative, (h, w) float32 per frame, larger is nearer.
+
+    Every frame has a scale (20 % spread) and a shift (10 to 20 % of the range of inverse depths) of its own.
+    The error is smooth over the image; half of its variance stays over the shot, half changes slowly.
+
+    Args:
+        shot: gives the true depth.
+        error: standard deviation of the error as a fraction of the inverse depth.
+        seed: of everything random.
+    """
+    generator = np.random.default_rng([seed, 2])
+    height, width = shot.depths[0].shape
+    fixed, changing = (_smooth_field(generator, height, width) for _ in range(2))
+    memory = np.exp(-1 / FRAMES_PER_SECOND)
+    priors = []
+    for depth in shot.depths:
+        inverse = np.exp(error * (fixed + changing) / np.sqrt(2)) / depth
+        scale = np.exp(0.2 * generator.standard_normal())
+        shift = generator.uniform(0.1, 0.2) * np.ptp(np.percentile(inverse, [2, 98]))
+        priors.append((scale * (inverse + shift)).astype(np.float32))
+        fresh = _smooth_field(generator, height, width)
+        changing = memory * changing + np.sqrt(1 - memory**2) * fresh
+    return priors
+
+
+def write_shot(shot: RenderedShot, folder: str | Path) -> None:
+    """Write ``shot.mp4``, ``depth/%06d.npy`` (`simulate_prior`), ``camera.json`` and ``groundtruth.txt``.
+
+    The lines of ``groundtruth.txt`` are ``frame tx ty tz qx qy qz qw``, camera-to-world.
+
+    Raises:
+        InputError: the folder cannot be written or OpenCV cannot encode the video.
+    """
+    folder = Path(folder)
+    try:
+        (folder / "depth").mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"folder {folder} cannot be written: {error.strerror}") from error
+    for index, prior in enumerate(simulate_prior(shot)):
+        np.save(folder / "depth" / f"{index:06d}.npy", prior)
+    (folder / "camera.json").write_text(json.dumps(camera_to_json(shot.camera), indent=1) + "\n")
+    lines = []
+    for index, pose in enumerate(shot.cam_from_world):
+        world_from_cam = pose.inverse()
+        numbers = [*world_from_cam.translation, *world_from_cam.rotation.quat]
+        lines.append(" ".join([str(index), *(f"{number:.9f}" for number in numbers)]) + "\n")
+    (folder / "groundtruth.txt").write_text("".join(lines))
+    video = cv2.VideoWriter(
+        str(folder / "shot.mp4"),
+        cv2.VideoWriter.fourcc(*"mp4v"),
+        FRAMES_PER_SECOND,
+        (shot.camera.width, shot.camera.height),
+    )
+    if not video.isOpened():
+        raise InputError(f"OpenCV cannot encode the video {folder / 'shot.mp4'}")
+    for image in shot.images:
+        video.write(image)
+    video.release()
+
+
+def _smooth_field(generator: np.random.Generator, height: int, width: int) -> Floats:
+    """(height, width) of zero mean and unit deviation, correlated over about a quarter of the image."""
+    coarse = generator.standard_normal((6, 8))
+    field = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
+    return np.asarray((field - field.mean()) / field.std())
