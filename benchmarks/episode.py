@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.inputs import NETWORK_FILES, open_shot
+from benchmarks.markdown import table
 from benchmarks.plan import FULL
 from benchmarks.run import HERE, machine
-from benchmarks.tables import table
 from factorsfm import InputError, find_shots, read_result, reconstruct
 from factorsfm.evaluation.alignment import pose_arrays
 from factorsfm.evaluation.metrics import trajectory_errors

@@ -28,9 +28,9 @@ from numpy.typing import NDArray
 
 from benchmarks.inputs import open_prior, open_shot
 from benchmarks.live import SIGMAS, sigmas
+from benchmarks.markdown import table
 from benchmarks.plan import FULL, STUDIO
 from benchmarks.run import HERE, machine
-from benchmarks.tables import table
 from factorsfm import (
     DepthKind,
     DepthMap,

@@ -18,9 +18,9 @@ import pycolmap
 from numpy.typing import NDArray
 
 from benchmarks.inputs import open_prior, open_shot
+from benchmarks.markdown import table
 from benchmarks.plan import FULL, STUDIO
 from benchmarks.run import HERE, machine
-from benchmarks.tables import table
 from factorsfm import Frame, FrameUpdate, MaskFolder, Stream, open_source
 from factorsfm.evaluation.alignment import pose_arrays
 from factorsfm.evaluation.metrics import auc, trajectory_errors

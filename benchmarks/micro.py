@@ -18,8 +18,8 @@ from gtsam.symbol_shorthand import A, L, T, X
 from numpy.typing import NDArray
 
 from benchmarks.inputs import NETWORK_FILES
+from benchmarks.markdown import table
 from benchmarks.run import HERE, machine
-from benchmarks.tables import table
 from factorsfm import DepthModel, Frame, TrackerOptions
 from factorsfm.camera import normalized_from_pixels
 from factorsfm.evaluation.alignment import pose_arrays

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from benchmarks import figures
+from benchmarks.comparison import POSE, against_colmap, no_harm
+from benchmarks.markdown import table
 from benchmarks.plan import COLMAP, DEGRADED, KITCHEN, STUDIO
 from benchmarks.scores import (
     Label,
@@ -29,7 +31,6 @@ from benchmarks.scores import (
 from benchmarks.store import Record, load
 
 HERE = Path(__file__).parent
-POSE = ("ATE 0.2 cm", "ATE 2 cm", "T-RPE 0.1 cm", "T-RPE 0.5 cm", "R-RPE 0.02°", "R-RPE 0.1°")
 WITHIN = ("points within 5 % of depth", "the same, at its own scale")
 DEPTH = (
     ["within 5%", "delta<1.05", "delta<1.05^2", "delta<1.05^3", "delta<1.25", "delta<1.25^2", "delta<1.25^3"]
@@ -46,36 +47,11 @@ def draw(output: Path, cache: Path) -> None:
     for name, (title, section) in SECTIONS.items():
         if name in experiments:
             parts += [f"## {title}", *section(experiments[name], output)]
-    parts += [*_no_harm(experiments), *_cost(experiments), *_failures(experiments)]
+    parts += [*against_colmap(experiments), *no_harm(experiments), *_cost(experiments), *_failures(experiments)]
     if any(parallax_of(record) for records in experiments.values() for record in records):
         figures.parallax_histogram([r for records in experiments.values() for r in records], output / "parallax.png")
         parts += ["## Parallax of the shots", "![Number of shots by parallax](parallax.png)"]
     (output / "RESULTS.md").write_text("\n\n".join(parts) + "\n")
-
-
-def table(header: Sequence[str], rows: Iterable[Sequence[Any]], best: Callable[..., float] | None = None) -> str:
-    """A Markdown table; the best of each column of floats is bold where `best` (max or min) is given."""
-    rows = [list(row) for row in rows]
-    marks: dict[int, str] = {}
-    if best is not None and len(rows) > 1:
-        for column in range(len(header)):
-            values = [row[column] for row in rows if isinstance(row[column], float) and np.isfinite(row[column])]
-            if len({_text(value) for value in values}) > 1:
-                marks[column] = _text(best(values))
-    lines = [
-        [f"**{text}**" if marks.get(i) == (text := _text(value)) else _text(value) for i, value in enumerate(row)]
-        for row in rows
-    ]
-    align = ["---:" if rows and isinstance(rows[0][i], int | float) else "---" for i in range(len(header))]
-    return "\n".join("| " + " | ".join(cells) + " |" for cells in [list(header), align, *lines])
-
-
-def _text(value: object) -> str:
-    if not isinstance(value, float):
-        return str(value)
-    if not np.isfinite(value):
-        return "–"
-    return f"{value:.1f}" if abs(value) < 1000 else f"{value:.0f}"
 
 
 def pose_table(records: Records) -> str:
@@ -240,29 +216,6 @@ SECTIONS: Mapping[str, tuple[str, Callable[[Records, Path], list[str]]]] = {
     "networks": ("Depth networks", _networks),
     "noise": ("Noise on the true depth", _pooled),
 }
-
-
-def _no_harm(experiments: Mapping[str, Records]) -> list[str]:
-    """`default` against the better of `geometry` and `paper`, column by column."""
-    rows: list[list[Any]] = []
-    for name, records in experiments.items():
-        found = {(r.cell.shot, r.cell.variant, r.cell.method, r.cell.prior): r for r in records}
-        for (shot, variant, method, prior), record in found.items():
-            others = [(shot, variant, "geometry", "none"), (shot, variant, "paper", prior)]
-            rivals = [pose_aucs([found[key]]) for key in others if key in found]
-            if method == "default" and name != "edge" and rivals:
-                differences = np.array(pose_aucs([record])) - np.max(rivals, axis=0)
-                rows.append([name, shot, variant, prior, *(f"{d:+.1f}" for d in differences), float(differences.min())])
-    if not rows:
-        return []
-    rows.sort(key=lambda row: row[-1])
-    behind = sum(row[-1] < -3.0 for row in rows)
-    header = ["experiment", "shot", "variant", "prior", *POSE, "worst"]
-    return [
-        "## Default against the better of geometry and paper",
-        f"Points of AUC, shot by shot, worst first. More than 3 points behind in a column: {behind} of {len(rows)}.",
-        table(header, rows),
-    ]
 
 
 def _cost(experiments: Mapping[str, Records]) -> list[str]:

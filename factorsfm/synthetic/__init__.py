@@ -2,7 +2,6 @@
 
 from factorsfm.synthetic.scene import Motion, SyntheticScene, room_camera, synthetic_scene
 from factorsfm.synthetic.shot import (
-    FRAMES_PER_SECOND,
     RenderedShot,
     render_shot,
     render_views,
@@ -11,7 +10,6 @@ from factorsfm.synthetic.shot import (
 )
 
 __all__ = [
-    "FRAMES_PER_SECOND",
     "Motion",
     "RenderedShot",
     "SyntheticScene",
