@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from command_line import assert_error
+from photographs import photographs
 
 from factorsfm import (
     Frame,
@@ -24,7 +25,6 @@ from factorsfm import (
 from factorsfm.camera import pixels_from_normalized
 from factorsfm.evaluation.alignment import align, pose_arrays
 from factorsfm.evaluation.metrics import trajectory_errors
-from factorsfm.evaluation.readers import read_shot
 from factorsfm.export import export
 from factorsfm.synthetic import RenderedShot, render_shot
 
@@ -245,18 +245,15 @@ def test_a_camera_that_does_not_move_has_no_points_to_register_on(tmp_path: Path
 
 @pytest.mark.slow
 def test_photographs_are_added_to_a_real_set(shared_data: Path, tmp_path: Path) -> None:
-    """Fountain-P11: 8 images and 3 further ones; measured 1.0, 3.6 and 1.2 mm, as the solution of all 11 has them."""
-    shot = read_shot(shared_data / "real" / "fountain-P11")
-    files = sorted((shared_data / "real" / "fountain-P11" / "images").iterdir())
-    late = (2, 5, 9)
-    for name in ("old", "new"):
-        (tmp_path / name).mkdir()
-    for k, file in enumerate(files):
-        shutil.copy(file, tmp_path / ("new" if k in late else "old"))
-    base = reconstruct(tmp_path / "old", camera=shot.camera, depth=None, unordered=True)
-    result = add_images(base, tmp_path / "new")
-    order = np.array([[file.name for file in files].index(frame.name) for frame in result.frames])
-    errors = trajectory_errors(*pose_arrays([f.cam_from_world for f in result.frames]), *shot.truth(order))
+    """Fountain-P11: 8 images and 3 further ones."""
+    scene = photographs(shared_data / "real" / "fountain-P11")
+    names = list(scene.images)
+    late = [names[k] for k in (2, 5, 9)]
+    old = scene.write(tmp_path / "old", [name for name in names if name not in late])
+    base = reconstruct(old, camera=scene.camera, depth=None, unordered=True)
+    result = add_images(base, scene.write(tmp_path / "new", late))
+    order = np.array([names.index(frame.name) for frame in result.frames])
+    errors = trajectory_errors(*pose_arrays([f.cam_from_world for f in result.frames]), *scene.shot.truth(order))
     assert len(result.registered) == 11
     assert 0.0005 < np.median(errors.ate) < 0.0035  # metres
     assert errors.ate[8:].max() < 0.005

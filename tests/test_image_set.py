@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from photographs import photographs
 
 from factorsfm import (
     ExportOptions,
@@ -24,8 +25,8 @@ from factorsfm import (
 )
 from factorsfm.camera import camera_to_json, guess_camera
 from factorsfm.evaluation.alignment import pose_arrays
+from factorsfm.evaluation.baselines import colmap_default, match_frames
 from factorsfm.evaluation.metrics import TrajectoryErrors, auc, relative_pose_errors, trajectory_errors
-from factorsfm.evaluation.readers import read_shot
 from factorsfm.export import export
 from factorsfm.image_set import ImageSet, _for_image_sets
 from factorsfm.images import ImageTracks
@@ -512,29 +513,32 @@ def test_sets_and_shots_are_told_apart(shot: RenderedShot, tmp_path: Path) -> No
 @pytest.mark.slow
 def test_two_real_scenes_in_one_folder(shared_data: Path, tmp_path: Path) -> None:
     """The photographs of both were taken with one lens."""
-    shots = [read_shot(shared_data / "real" / name) for name in ("fountain-P11", "herzjesu-P8")]
-    for name in ("fountain-P11", "herzjesu-P8"):
-        for path in sorted((shared_data / "real" / name / "images").iterdir()):
-            image = cv2.imread(str(path), cv2.IMREAD_REDUCED_COLOR_2)
-            cv2.imwrite(str(tmp_path / f"{name}-{path.stem}.png"), image)
-    camera = pycolmap.Camera(shots[0].camera.todict())
-    camera.rescale(image.shape[1], image.shape[0])
-    result = reconstruct(tmp_path, camera=camera, depth=None)
-    for part, shot, size in zip((result, *result.others), shots, (11, 8), strict=True):
-        assert len(part.registered) == size
+    scenes = [photographs(shared_data / "real" / name) for name in ("fountain-P11", "herzjesu-P8")]
+    for name, scene in zip("ab", scenes, strict=True):
+        scene.write(tmp_path, list(scene.images)[:6], prefix=name)
+    result = reconstruct(tmp_path, camera=scenes[0].camera, depth=None)
+    for part, scene in zip((result, *result.others), scenes, strict=True):
+        assert len(part.registered) == 6
         estimate = pose_arrays([frame.cam_from_world for frame in part.registered])
-        assert auc(relative_pose_errors(*estimate, shot.rotations, shot.centers), 1.0) > 75.0
+        truth = scene.shot.rotations[:6], scene.shot.centers[:6]
+        assert auc(relative_pose_errors(*estimate, *truth), 1.0) > 75.0
 
 
 @pytest.mark.slow
-def test_strecha_photographs_as_well_as_colmap(shared_data: Path) -> None:
-    """COLMAP's incremental mapper reaches 93.6 % and 3.9 mm here (same images, same lens)."""
-    folder = shared_data / "real" / "herzjesu-P8"
-    shot = read_shot(folder)
-    result = reconstruct(folder / "images", camera=shot.camera, depth=None, unordered=True)
-    estimate = pose_arrays([frame.cam_from_world for frame in result.frames])
-    assert np.isfinite(estimate[1]).all()
-    errors = relative_pose_errors(*estimate, shot.rotations, shot.centers)
-    assert 93.0 < auc(errors, 1.0) < 96.0
-    ate = trajectory_errors(*estimate, shot.rotations, shot.centers).ate
-    assert np.sqrt((ate**2).mean()) < 0.005
+def test_strecha_photographs_as_well_as_colmap(shared_data: Path, tmp_path: Path) -> None:
+    scene = photographs(shared_data / "real" / "herzjesu-P8")
+    folder = scene.write(tmp_path / "images")
+    truth = scene.shot.rotations, scene.shot.centers
+    result = reconstruct(folder, camera=scene.camera, depth=None, unordered=True)
+    ours = pose_arrays([frame.cam_from_world for frame in result.frames])
+    frames = [Frame(k, image, name) for k, (name, image) in enumerate(scene.images.items())]
+    shot = replace(scene.shot, camera=scene.camera, masks=None)
+    (tmp_path / "colmap").mkdir()
+    colmap = colmap_default(match_frames(shot, frames, tmp_path / "colmap"))
+    assert np.isfinite(ours[1]).all()
+    assert np.isfinite(colmap.centers).all()
+    theirs = colmap.rotations, colmap.centers
+    scores = [auc(relative_pose_errors(*poses, *truth), 1.0) for poses in (ours, theirs)]
+    errors = [float(np.sqrt((trajectory_errors(*poses, *truth).ate ** 2).mean())) for poses in (ours, theirs)]
+    assert scores[1] - 2.0 < scores[0] < 97.0
+    assert 0.001 < errors[0] < 1.1 * errors[1]
