@@ -182,7 +182,7 @@ def _map_seconds(focal: float, images: list[MappedImage], points: Array) -> list
     for k in range(len(images)):
         start = time.perf_counter()
         copy = MapCopy([replace(image) for image in images[: k + 1]], mapped.copy(), MapperOptions(), focal)
-        update = update_map(copy, graph, None)
+        update = update_map(copy, graph)
         times.append(time.perf_counter() - start)
         if not update.committed:
             raise RuntimeError(f"update {k} with {len(points)} landmarks: {update.reason}")

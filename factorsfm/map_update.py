@@ -1,7 +1,7 @@
 """What a new keyframe does to the map: its depth, new points, and the graph solved for all that it concerns.
 
-An update works on copies and touches nothing but the graph, so that it can run beside the registration of the frames
-that follow; the mapper takes its result over when it is due.
+An update works on copies and touches nothing but the graph, so that it can run in another process, beside the
+registration of the frames that follow; the mapper takes its result over when it is due.
 """
 
 from __future__ import annotations
@@ -85,14 +85,28 @@ class MapCopy:
     focal: float
     refine_focal: bool = False
 
+    @property
+    def newest(self) -> MappedImage:
+        """The new keyframe."""
+        return self.keyframes[-1]
 
-def update_map(copy: MapCopy, graph: FactorGraph, read_depth: Callable[[], ImageDepth | None] | None) -> MapUpdate:
-    """Depth of the new keyframe, new landmarks, and what the graph makes of all keyframes around."""
-    o, newest = copy.options, copy.keyframes[-1]
-    position = newest.tracks.position
-    if newest.tracks.depth is None and read_depth is not None:
-        newest.tracks = replace(newest.tracks, depth=read_depth())
-    depth = newest.tracks.depth
+    def read_depth(self, read: Callable[[], ImageDepth | None]) -> None:
+        """Give the new keyframe its prior, unless it has one."""
+        if self.newest.tracks.depth is None:
+            self.newest.tracks = replace(self.newest.tracks, depth=read())
+
+    def needed(self) -> MapCopy:
+        """As much of it as makes a difference to an update, which does not grow with the length of the shot."""
+        before, free = _taking_part(self.keyframes)
+        keyframes = before + free
+        points = self.points.part(np.concatenate([image.tracks.ids for image in keyframes]))
+        return replace(self, keyframes=keyframes, points=points)
+
+
+def update_map(copy: MapCopy, graph: FactorGraph) -> MapUpdate:
+    """New landmarks, and what the graph makes of all keyframes around the new one."""
+    o, newest = copy.options, copy.newest
+    position, depth = newest.tracks.position, newest.tracks.depth
     guidance = DepthGuidance(o, copy.points)
     guidance.fit(newest)
     affine = {position: newest.affine} if newest.affine is not None else {}
@@ -133,13 +147,19 @@ def _better_focal(adjustment: BundleAdjustment, held: NDArray[np.bool_]) -> floa
     return float(np.exp(state.log_focal[0]))
 
 
-def _window(keyframes: list[MappedImage]) -> tuple[list[MappedImage], NDArray[np.bool_]]:
-    """The keyframes that take part, in order of time, and which of them are constant."""
+def _taking_part(keyframes: list[MappedImage]) -> tuple[list[MappedImage], list[MappedImage]]:
+    """Those before the newest ones that share most with the last, and the newest ones, in order of time."""
     free = keyframes[-_FREE_KEYFRAMES:]
     before = keyframes[: -len(free)]
     shared = np.array([shared_tracks(image.tracks, keyframes[-1].tracks) for image in before], np.int64)
     chosen = np.sort(np.argsort(-shared, kind="stable")[:_HELD_KEYFRAMES])
-    window = [before[k] for k in chosen if shared[k] >= _LEAST_SHARED] + free
+    return [before[k] for k in chosen], free
+
+
+def _window(keyframes: list[MappedImage]) -> tuple[list[MappedImage], NDArray[np.bool_]]:
+    """The keyframes that take part, in order of time, and which of them are constant."""
+    before, free = _taking_part(keyframes)
+    window = [image for image in before if shared_tracks(image.tracks, free[-1].tracks) >= _LEAST_SHARED] + free
     held = np.arange(len(window)) < len(window) - len(free)
     # Two constant cameras keep place and size; at the start the first one is the world.
     held[: 2 if before else 1] = True

@@ -6,7 +6,7 @@ import itertools
 import logging
 import math
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from dataclasses import replace
 from typing import Any
 
@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.factors import camera_points, cross_matrices
-from factorsfm.graph import FactorGraph
+from factorsfm.graph_process import GraphProcess
 from factorsfm.images import ImageTracks, MappedImage, median_flow, renormalize, shared_tracks
 from factorsfm.initialization import NoStart, Start
-from factorsfm.map_update import MapCopy, MapUpdate, update_map
+from factorsfm.map_update import MapCopy, MapUpdate
 from factorsfm.options import Options
 from factorsfm.point_map import PointMap
 from factorsfm.reconstruction import FrameStatus
@@ -62,8 +62,7 @@ class Mapper:
         self.outliers = np.zeros(0, np.int64)  # tracks that the last image showed to be wrong
         self.new_points = 0  # that came with the last image
         self.parallax = 0.0  # largest so far
-        self.graph = FactorGraph()
-        self._worker = ThreadPoolExecutor(1, "factorsfm-graph")
+        self._graph = GraphProcess()
         self._update: Future[MapUpdate] | None = None
         self._due = 0
         self._advanced = -1  # number of images for which `advance` was called last
@@ -162,7 +161,7 @@ class Mapper:
 
     def close(self) -> None:
         """Let the graph go; what it is working on is lost."""
-        self._worker.shutdown(cancel_futures=True)
+        self._graph.close()
 
     def refresh(self) -> None:
         """Register the images between the keyframes once more, on the map as it is now."""
@@ -231,8 +230,8 @@ class Mapper:
                 image.forget(FrameStatus.WAITING, "waiting for the start of another map")
             elif image.registered:
                 image.forget(FrameStatus.LOST, f"on a map of {joined} images that none of those that followed joined")
-        self.points, self.graph = PointMap(), FactorGraph()
-        self.keyframes, self.parallax, self.started = [], 0.0, False
+        self._graph.start_anew()
+        self.points, self.keyframes, self.parallax, self.started = PointMap(), [], 0.0, False
 
     # --- registration -------------------------------------------------------------------------------------------
 
@@ -366,7 +365,7 @@ class Mapper:
         keyframes = [replace(self.images[k]) for k in self.keyframes] + [replace(image)]
         copy = MapCopy(keyframes, self.points.copy(), self.options, self.focal, self._refine_focal)
         read = read_depth if self._uses_keyframe_depth else None
-        self._update = self._worker.submit(update_map, copy, self.graph, read)
+        self._update = self._graph.submit(copy, read)
         image.keyframe = True
         settled = _SETTLED_DELAY if len(self.keyframes) >= _SETTLED else 0
         self._due = len(self.images) - 1 + self.options.graph_delay + settled

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -44,6 +46,16 @@ class PointMap:
         """An independent copy."""
         return PointMap(self._points)
 
+    def part(self, ids: Index) -> PointMap:
+        """An independent copy that holds no other tracks than these."""
+        ids = ids[self.contains(ids)]
+        part = PointMap()
+        part.set(ids, self.at(ids))
+        return part
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _filled, self.all()
+
     @property
     def table(self) -> Array:
         """Positions by track id, NaN where there is none."""
@@ -62,3 +74,9 @@ class PointMap:
     def _seen_from(self, image: MappedImage, ids: Index) -> Array:
         points = self.at(ids)
         return camera_points(*image.pose, points, np.ones(len(points)))
+
+
+def _filled(ids: Index, points: Array) -> PointMap:
+    filled = PointMap()
+    filled.set(ids, points)
+    return filled

@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import pycolmap
 
 
 class FrameStatus(StrEnum):
