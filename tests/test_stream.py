@@ -1,5 +1,7 @@
 """The stream: what it takes, what it refuses, and that it equals the one call."""
 
+import os
+import signal
 from dataclasses import replace
 
 import cv2
@@ -287,3 +289,19 @@ def test_options_are_written_with_the_result(run):
     assert result.options["preset"] == "default"
     other = stream(options=replace(QUICK, preset="mine"))
     assert other.options.to_dict()["preset"] == "mine"
+
+
+def test_a_graph_whose_process_is_killed_comes_back(run, caplog):
+    s = stream()
+    updates = []
+    for k, image in enumerate(rendered("dolly").images):
+        updates.append(s.push(image))
+        if k in (2, 5):
+            os.kill(s._mapper._graph._process._popen.pid, signal.SIGKILL)
+    result = s.finish()
+    assert 1 <= len(caplog.messages) <= 2
+    assert all("rolled back: the process of the graph was killed by SIGKILL" in m for m in caplog.messages)
+    assert {u.status for u in updates} == {FrameStatus.REGISTERED}
+    assert np.median(errors_of(result, rendered("dolly")).ate) < 0.01
+    undisturbed = sum(u.keyframe for u in run[0])
+    assert undisturbed - len(caplog.messages) <= sum(f.keyframe for f in result.frames) <= undisturbed
