@@ -106,6 +106,7 @@ class FlowTracker:
         born = self._replenish(frame, mask)
         self._previous, self._texture = frame, texture
         self._frame += 1
+        self._patches.warp_ahead(self._pool)
         return TrackedFrame(self._ids.copy(), self._xy.astype(np.float64), lost, born, texture)
 
     def drop(self, ids: NDArray[np.int64]) -> None:

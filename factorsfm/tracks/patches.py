@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import cv2
@@ -41,9 +41,11 @@ class BirthPatches:
         self._affine = np.zeros((0, 2, 2), np.float32)  # birth patch -> current frame
         self._warped_by = np.zeros((0, 2, 2), np.float32)
         self._warped = np.zeros((0, tile, tile), np.uint8)
+        self._warping: list[Future[None]] = []
 
     def add(self, grey: Image, xy: Array) -> None:
         """Store the patches around points of the current frame."""
+        self._wait()
         patches = _cut(grey, xy)
         unit = np.tile(np.eye(2, dtype=np.float32), (len(xy), 1, 1))
         inner = slice(_SUPPORT - self._half, _SUPPORT + self._half + 1)
@@ -54,6 +56,7 @@ class BirthPatches:
 
     def take(self, rows: NDArray[np.bool_] | Rows) -> BirthPatches:
         """Patches of their own for some of the tracks."""
+        self._wait()
         taken = BirthPatches(self._window[0])
         for name in _ARRAYS:
             setattr(taken, name, getattr(self, name)[rows])
@@ -61,11 +64,13 @@ class BirthPatches:
 
     def append(self, other: BirthPatches) -> None:
         """Add the tracks of others."""
+        self._wait()
         for name in _ARRAYS:
             setattr(self, name, np.concatenate([getattr(self, name), getattr(other, name)]))
 
     def state(self) -> dict[str, NDArray[Any]]:
         """Everything that `restore` needs."""
+        self._wait()
         return {name: getattr(self, name) for name in _ARRAYS}
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
@@ -75,6 +80,7 @@ class BirthPatches:
 
     def keep(self, index: NDArray[np.bool_] | Rows | slice) -> None:
         """Forget all others."""
+        self._wait()
         self._patches = self._patches[index]
         self._affine = self._affine[index]
         self._warped_by = self._warped_by[index]
@@ -83,6 +89,17 @@ class BirthPatches:
     def move(self, linear: Array) -> None:
         """Follow the (n, 2, 2) linear parts of the local motion between two frames."""
         self._affine = linear @ self._affine
+
+    def warp_ahead(self, pool: ThreadPoolExecutor) -> None:
+        """Prepare the alignment with the next frame, of which only the position is missing, while nobody waits."""
+        self._wait()
+        self._warping = [pool.submit(self._warp, rows) for rows in np.array_split(np.arange(len(self._affine)), 2)]
+
+    def _wait(self) -> None:
+        """Nothing may be changed while patches are warped."""
+        for part in self._warping:
+            part.result()
+        self._warping.clear()
 
     def align(
         self,
@@ -101,6 +118,7 @@ class BirthPatches:
                 where too many others do not.
             reach_px: largest distance from `start`.
         """
+        self._wait()
         checked = np.ones(len(rows), bool) if checked is None else checked
 
         def part(index: Rows) -> tuple[Array, NDArray[np.bool_]]:
