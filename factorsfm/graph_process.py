@@ -131,7 +131,9 @@ class _Process:
             self._end()
             code = self._popen.returncode
             if code >= 0:
-                raise FactorsfmError(f"the process of the graph ended with status {code}, see standard error") from error
+                raise FactorsfmError(
+                    f"the process of the graph ended with status {code}, see standard error"
+                ) from error
             self._start()
             raise _EndedError(f"the process of the graph was killed by {signal.Signals(-code).name}") from error
         return answer

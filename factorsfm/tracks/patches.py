@@ -22,8 +22,7 @@ _FINE = (_STOP, 20, 0.01)
 _ALL_GOOD = 0.7  # share of the checked ones that must come back, or the others are checked, too
 _BACK = (_STOP, 5, 0.03)  # the way back only has to tell whether it ends where it began
 
-
-_ARRAYS = ("_patches", "_affine", "_warped_by", "_warped")
+_LARGE, _SMALL = ("_patches", "_warped"), ("_affine", "_warped_by")
 
 
 class BirthPatches:
@@ -37,54 +36,68 @@ class BirthPatches:
         self._window = (window_px, window_px)
         self._half = window_px // 2 + _MARGIN
         side, tile = 2 * _SUPPORT + 1, 2 * self._half + 1
+        self._slots = np.zeros(0, np.intp)  # of each track in the large arrays, which are not copied at every frame
         self._patches = np.zeros((0, side, side), np.uint8)
+        self._warped = np.zeros((0, tile, tile), np.uint8)
         self._affine = np.zeros((0, 2, 2), np.float32)  # birth patch -> current frame
         self._warped_by = np.zeros((0, 2, 2), np.float32)
-        self._warped = np.zeros((0, tile, tile), np.uint8)
         self._warping: list[Future[None]] = []
 
     def add(self, grey: Image, xy: Array) -> None:
         """Store the patches around points of the current frame."""
-        self._wait()
         patches = _cut(grey, xy)
         unit = np.tile(np.eye(2, dtype=np.float32), (len(xy), 1, 1))
         inner = slice(_SUPPORT - self._half, _SUPPORT + self._half + 1)
-        self._patches = np.r_[self._patches, patches]
-        self._affine = np.r_[self._affine, unit]
-        self._warped_by = np.r_[self._warped_by, unit]
-        self._warped = np.r_[self._warped, patches[:, inner, inner]]
+        self._join({"_patches": patches, "_warped": patches[:, inner, inner], "_affine": unit, "_warped_by": unit})
 
     def take(self, rows: NDArray[np.bool_] | Rows) -> BirthPatches:
         """Patches of their own for some of the tracks."""
-        self._wait()
         taken = BirthPatches(self._window[0])
-        for name in _ARRAYS:
-            setattr(taken, name, getattr(self, name)[rows])
+        taken._join(self._of(rows))
         return taken
 
     def append(self, other: BirthPatches) -> None:
         """Add the tracks of others."""
-        self._wait()
-        for name in _ARRAYS:
-            setattr(self, name, np.concatenate([getattr(self, name), getattr(other, name)]))
+        self._join(other.state())
 
     def state(self) -> dict[str, NDArray[Any]]:
         """Everything that `restore` needs."""
-        self._wait()
-        return {name: getattr(self, name) for name in _ARRAYS}
+        return self._of(slice(None))
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Go on where `state` was taken."""
-        for name in _ARRAYS:
-            setattr(self, name, state[name])
+        self.keep(slice(0))
+        self._join(state)
 
     def keep(self, index: NDArray[np.bool_] | Rows | slice) -> None:
         """Forget all others."""
         self._wait()
-        self._patches = self._patches[index]
-        self._affine = self._affine[index]
-        self._warped_by = self._warped_by[index]
-        self._warped = self._warped[index]
+        for name in ("_slots", *_SMALL):
+            setattr(self, name, getattr(self, name)[index])
+
+    def _of(self, index: NDArray[np.bool_] | Rows | slice) -> dict[str, NDArray[Any]]:
+        self._wait()
+        large = {name: getattr(self, name)[self._slots[index]] for name in _LARGE}
+        return {**large, **{name: getattr(self, name)[index] for name in _SMALL}}
+
+    def _join(self, tracks: Mapping[str, NDArray[Any]]) -> None:
+        """Add tracks, in slots that nobody uses any more where there are enough."""
+        self._wait()
+        count = len(tracks["_affine"])
+        missing = count - (len(self._patches) - len(self._slots))
+        if missing > 0:
+            more = max(missing, len(self._patches) // 2)
+            for name in _LARGE:
+                array = getattr(self, name)
+                setattr(self, name, np.concatenate([array, np.zeros((more, *array.shape[1:]), np.uint8)]))
+        free = np.ones(len(self._patches), bool)
+        free[self._slots] = False
+        slots = np.flatnonzero(free)[:count]
+        for name in _LARGE:
+            getattr(self, name)[slots] = tracks[name]
+        self._slots = np.r_[self._slots, slots]
+        for name in _SMALL:
+            setattr(self, name, np.concatenate([getattr(self, name), tracks[name]]))
 
     def move(self, linear: Array) -> None:
         """Follow the (n, 2, 2) linear parts of the local motion between two frames."""
@@ -132,7 +145,7 @@ class BirthPatches:
         self, grey: Image, rows: Rows, start: Array, check_px: float, reach_px: float, checked: NDArray[np.bool_]
     ) -> tuple[Array, NDArray[np.bool_]]:
         self._warp(rows)
-        atlas, centers = _atlas(self._warped[rows], grey.shape)
+        atlas, centers = _atlas(self._warped[self._slots[rows]], grey.shape)
         aligned, status, _ = cv2.calcOpticalFlowPyrLK(
             atlas, grey, centers, start.copy(), winSize=self._window, maxLevel=0, criteria=_FINE,
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
@@ -158,7 +171,8 @@ class BirthPatches:
         """Warp the patches whose map has changed."""
         change = np.abs(self._affine[rows] - self._warped_by[rows]).sum(axis=2).max(axis=1) * self._half
         stale = rows[change > _STALE_PX]
-        self._warped[stale] = _warped(self._patches[stale], self._affine[stale], self._half)
+        slots = self._slots[stale]
+        self._warped[slots] = _warped(self._patches[slots], self._affine[stale], self._half)
         self._warped_by[stale] = self._affine[stale]
 
 
