@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import os
-import resource
 import shutil
 import sys
 import tempfile
@@ -24,6 +23,7 @@ from numpy.typing import NDArray
 from benchmarks.inputs import VARIANTS, open_frames, open_prior, open_shot
 from benchmarks.plan import AS_SET, COLMAP, UNORDERED, Cell
 from benchmarks.store import Record, cell_key, record_path, save
+from benchmarks.usage import cpu_seconds, peak_mb
 from factorsfm import MaskFolder, Options, Reconstruction, Stream
 from factorsfm.evaluation import baselines
 from factorsfm.evaluation.alignment import pose_arrays
@@ -77,8 +77,8 @@ def measure(cell: Cell, folders: Folders) -> Record:
         traceback.print_exc()
         return unregistered(cell, shot, f"{type(error).__name__}: {error}")
     record = judge(cell, shot, estimate)
-    record.facts.setdefault("cpu_seconds", _cpu_seconds())
-    record.facts["peak_mb"] = max(_peak_mb(), record.facts.get("peak_mb", 0.0))
+    record.facts.setdefault("cpu_seconds", cpu_seconds())
+    record.facts["peak_mb"] = max(peak_mb(), record.facts.get("peak_mb", 0.0))
     record.facts["load"] = load
     return record
 
@@ -187,7 +187,7 @@ def _estimate(result: Reconstruction, seconds: Mapping[str, float], given: tuple
 def _baseline(cell: Cell, shot: Shot, folders: Folders) -> Estimate:
     """A COLMAP mapper on matches that all mappers of the shot share."""
     matches, matching = _matches(cell, shot, folders)
-    before = _cpu_seconds()
+    before = cpu_seconds()
     result = getattr(baselines, cell.method)(matches)
     return Estimate(
         result.indices,
@@ -198,7 +198,7 @@ def _baseline(cell: Cell, shot: Shot, folders: Folders) -> Estimate:
         result.observation_depth,
         facts={
             "seconds": {**result.seconds, "total": sum(result.seconds.values())},
-            "cpu_seconds": matching["cpu_seconds"] + _cpu_seconds() - before,
+            "cpu_seconds": matching["cpu_seconds"] + cpu_seconds() - before,
             "peak_mb": matching["peak_mb"],
             "settings": result.settings,
             "points": len(result.points),
@@ -224,7 +224,7 @@ def _matches(cell: Cell, shot: Shot, folders: Folders) -> tuple[baselines.Matche
             facts = {
                 "indices": made.indices.tolist(),
                 "seconds": dict(made.seconds),
-                "cost": {"cpu_seconds": _cpu_seconds(), "peak_mb": _peak_mb()},
+                "cost": {"cpu_seconds": cpu_seconds(), "peak_mb": peak_mb()},
             }
             (scratch / "matches.json").write_text(json.dumps(facts))
             scratch.rename(folder)
@@ -232,15 +232,6 @@ def _matches(cell: Cell, shot: Shot, folders: Folders) -> tuple[baselines.Matche
             shutil.rmtree(scratch, ignore_errors=True)
     facts = json.loads((folder / "matches.json").read_text())
     return baselines.Matches(folder, np.array(facts["indices"]), facts["seconds"]), facts["cost"]
-
-
-def _cpu_seconds() -> float:
-    usage = resource.getrusage(resource.RUSAGE_SELF)
-    return usage.ru_utime + usage.ru_stime
-
-
-def _peak_mb() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
 
 def main() -> None:

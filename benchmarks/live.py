@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import resource
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from benchmarks.inputs import open_prior, open_shot
 from benchmarks.markdown import table
 from benchmarks.plan import FULL, STUDIO
 from benchmarks.run import HERE, machine
+from benchmarks.usage import resident_mb
 from factorsfm import Frame, FrameUpdate, MaskFolder, Stream, open_source
 from factorsfm.evaluation.alignment import pose_arrays
 from factorsfm.evaluation.metrics import auc, trajectory_errors
@@ -179,7 +179,7 @@ def long_stream(count: int) -> str:
         updates.append(stream.push(frame))
         latency.append(time.perf_counter() - start)
         if k in (_WARM_UP, count - 1):
-            memory[k] = _resident_mb()
+            memory[k] = resident_mb()
     early, late = np.mean(latency[200:700]), np.mean(latency[-500:])
     order = [k for k, _ in zip(_turns(len(shot.images)), range(count), strict=False)]
     truth = [shot.cam_from_world[k] for k in order]
@@ -210,11 +210,6 @@ def _turns(frames: int) -> Iterator[int]:
 def _back_and_forth(shot: RenderedShot) -> Iterator[Frame]:
     for number, k in enumerate(_turns(len(shot.images))):
         yield Frame(number, shot.images[k], f"{number:06d}")
-
-
-def _resident_mb() -> float:
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * resource.getpagesize() / 2**20
 
 
 def main() -> None:

@@ -1,6 +1,7 @@
 """The graph in a process of its own: the same results, and a life that ends with the parent's and not with its own."""
 
 import logging
+import multiprocessing.spawn
 import os
 import pickle
 import signal
@@ -224,14 +225,20 @@ def test_signals_that_end_the_parent_are_left_to_the_parent(graph, shot, number)
     assert graph.submit(shot.copy(3), None).result().committed
 
 
-def test_a_process_that_cannot_run_is_an_error(shot, monkeypatch, tmp_path):
+@pytest.fixture
+def broken_interpreter(tmp_path):
     broken = tmp_path / "python"
     broken.write_text("#!/bin/sh\nexit 3\n")
     broken.chmod(0o755)
-    monkeypatch.setattr(graph_process.spawn, "get_executable", lambda: str(broken))
+    before = multiprocessing.spawn.get_executable()
+    multiprocessing.set_executable(str(broken))
+    yield
+    multiprocessing.set_executable(before)
+
+
+def test_an_interpreter_that_cannot_run_is_an_error(shot, monkeypatch, broken_interpreter):
     monkeypatch.setattr(graph_process, "_kept", [])
-    graph = GraphProcess()
-    with pytest.raises(FactorsfmError, match="the process of the graph ended with status 3"):
+    with GraphProcess() as graph, pytest.raises(FactorsfmError, match="the process of the graph ended with status 3"):
         graph.submit(shot.copy(2), None).result()
 
 

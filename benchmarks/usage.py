@@ -1,0 +1,39 @@
+"""CPU time and memory of this process together with those that it has started, such as the graph's."""
+
+from __future__ import annotations
+
+import os
+import resource
+from pathlib import Path
+
+
+def cpu_seconds() -> float:
+    """Of all of them so far, ended ones included."""
+    usage = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    running = sum(_ticks(child) for child in _children()) / os.sysconf("SC_CLK_TCK")
+    return sum(u.ru_utime + u.ru_stime for u in usage) + running
+
+
+def peak_mb() -> float:
+    """Sum of the peaks of those that run; what they share counts for each."""
+    return _status_mb("VmHWM")
+
+
+def resident_mb() -> float:
+    """Sum over those that run now; what they share counts for each."""
+    return _status_mb("VmRSS")
+
+
+def _children() -> list[Path]:
+    lists = (task.joinpath("children").read_text() for task in Path("/proc/self/task").iterdir())
+    return [Path("/proc", child) for children in lists for child in children.split()]
+
+
+def _ticks(process: Path) -> int:
+    fields = (process / "stat").read_text().rpartition(")")[2].split()
+    return int(fields[11]) + int(fields[12])  # utime, stime
+
+
+def _status_mb(name: str) -> float:
+    lines = [line for process in (Path("/proc/self"), *_children()) for line in (process / "status").open()]
+    return sum(int(line.split()[1]) for line in lines if line.startswith(name)) / 1024.0
