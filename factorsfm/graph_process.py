@@ -128,6 +128,8 @@ class _Process:
             requests.flush()
             answer: Answer = pickle.load(answers)
         except (OSError, EOFError, pickle.UnpicklingError) as error:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._popen.wait(_SECONDS_TO_END)
             self._end()
             code = self._popen.returncode
             if code >= 0:
@@ -149,16 +151,13 @@ def _pipes(popen: subprocess.Popen[bytes]) -> tuple[IO[bytes], IO[bytes]]:
 
 
 def _end(popen: subprocess.Popen[bytes]) -> None:
-    """Close the pipes, at whose end the process ends, and wait for it."""
+    """End a process, which has nothing to tidy up."""
     requests, answers = _pipes(popen)
     with contextlib.suppress(BrokenPipeError):  # something was left to be written
         requests.close()
     answers.close()
-    try:
-        popen.wait(_SECONDS_TO_END)
-    except subprocess.TimeoutExpired:
-        popen.kill()
-        popen.wait()
+    popen.kill()
+    popen.wait()
 
 
 # One process is kept for the next map: a start costs as much as the tracking of ten frames or more.

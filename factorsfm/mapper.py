@@ -47,12 +47,13 @@ class Mapper:
     """Depth-guided incremental structure from motion over tracks.
 
     Args:
+        graph: that of the keyframes, closed with the mapper.
         focal: pixels; width: of the image, pixels.
         options: steps, thresholds and weights.
         has_prior: whether a depth prior exists at all; without one the start is the essential matrix.
     """
 
-    def __init__(self, focal: float, width: int, options: Options, *, has_prior: bool) -> None:
+    def __init__(self, graph: GraphProcess, focal: float, width: int, options: Options, *, has_prior: bool) -> None:
         self.options = options.mapper
         self.focal, self.first_focal = focal, focal
         self.width = width
@@ -62,7 +63,7 @@ class Mapper:
         self.outliers = np.zeros(0, np.int64)  # tracks that the last image showed to be wrong
         self.new_points = 0  # that came with the last image
         self.parallax = 0.0  # largest so far
-        self._graph = GraphProcess()
+        self._graph = graph
         self._update: Future[MapUpdate] | None = None
         self._due = 0
         self._advanced = -1  # number of images for which `advance` was called last

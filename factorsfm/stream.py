@@ -31,6 +31,7 @@ from factorsfm.control import Control, LocatedControl, locate
 from factorsfm.errors import InputError, ModelError, ReconstructionError
 from factorsfm.frame_update import FrameUpdate, KeyframePrior
 from factorsfm.frames import Frame, as_frame
+from factorsfm.graph_process import GraphProcess
 from factorsfm.images import ImageTracks, MappedImage
 from factorsfm.mapper import Mapper
 from factorsfm.options import Options
@@ -102,6 +103,7 @@ class Stream(Closing):
         self._relocalizer = Relocalizer()
         self._thumbnails = Thumbnails()
         self._threads: OneThreadEach | None = None
+        self._graph = GraphProcess()  # it starts while the source opens
         self._mapper: Mapper | None = None
         self._size = (0, 0)
         self._colors = np.zeros((0, 3), np.uint8)
@@ -295,8 +297,7 @@ class Stream(Closing):
 
     def close(self) -> None:
         """Give up without a result; `finish` closes, too."""
-        if self._mapper is not None:
-            self._mapper.close()
+        self._graph.close()
         if self._threads is not None:
             self._threads.close()
 
@@ -352,7 +353,7 @@ class Stream(Closing):
         assert self.camera is not None
         self._threads = OneThreadEach()
         focal = 0.5 * (self.camera.focal_length_x + self.camera.focal_length_y)
-        return Mapper(focal, self._size[0], self.options, has_prior=self._depth is not None)
+        return Mapper(self._graph, focal, self._size[0], self.options, has_prior=self._depth is not None)
 
     def _frame_update(self, frame: Frame, image: MappedImage, focal_changed: bool) -> FrameUpdate:
         mapper = self._mapper

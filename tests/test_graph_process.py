@@ -218,6 +218,19 @@ def test_killed_while_nobody_needs_it(shot):
         assert graph.submit(shot.copy(2), None).result().committed
 
 
+def test_a_fork_of_the_parent_leaves_it_alone(shot):
+    with GraphProcess() as graph:
+        graph.submit(shot.copy(2), None).result()
+        pid = pid_of(graph)
+    fork = os.fork()
+    if fork == 0:
+        os._exit(len(graph_process._kept))
+    assert os.waitpid(fork, 0)[1] == 0
+    with GraphProcess() as graph:
+        assert pid_of(graph) == pid
+        assert graph.submit(shot.copy(2), None).result().committed
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signals_that_end_the_parent_are_left_to_the_parent(graph, shot, number):
     assert graph.submit(shot.copy(2), None).result().committed

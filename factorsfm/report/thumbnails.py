@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import cv2
@@ -28,14 +29,15 @@ class Thumbnails:
 
     def __init__(self, most: int = _MOST) -> None:
         self._most = most
-        self._kept: dict[int, bytes] = {}
+        self._kept: dict[int, Future[bytes]] = {}
+        self._worker = ThreadPoolExecutor(1, "factorsfm-thumbnails")  # nobody waits for a picture
         self._added = 0
         self._step = 1
 
     def add(self, image: NDArray[np.uint8]) -> None:
         """Take the next frame, (h, w, 3) BGR or (h, w) grey."""
         if self._added % self._step == 0:
-            self._kept[self._added] = thumbnail(image)
+            self._kept[self._added] = self._worker.submit(thumbnail, image.copy())
         self._added += 1
         if len(self._kept) > self._most:
             self._step *= 2
@@ -43,16 +45,16 @@ class Thumbnails:
 
     def by_frame(self) -> list[bytes | None]:
         """One entry per frame that was added, None where none is kept."""
-        return [self._kept.get(position) for position in range(self._added)]
+        return [self._kept[k].result() if k in self._kept else None for k in range(self._added)]
 
     def state(self) -> dict[str, Any]:
         """Everything that `restore` needs."""
-        kept = {position: np.frombuffer(jpeg, np.uint8) for position, jpeg in self._kept.items()}
+        kept = {position: np.frombuffer(jpeg.result(), np.uint8) for position, jpeg in self._kept.items()}
         return {"kept": kept, "added": self._added, "step": self._step}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Go on where `state` was taken."""
-        self._kept = {position: jpeg.tobytes() for position, jpeg in state["kept"].items()}
+        self._kept = {position: _done(jpeg.tobytes()) for position, jpeg in state["kept"].items()}
         self._added, self._step = state["added"], state["step"]
 
     def attach(self, frames: Sequence[FrameResult]) -> None:
@@ -72,3 +74,9 @@ def thumbnail(image: NDArray[np.uint8]) -> bytes:
         image = np.asarray(cv2.resize(image, size), np.uint8)
     _, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
     return jpeg.tobytes()
+
+
+def _done(jpeg: bytes) -> Future[bytes]:
+    done: Future[bytes] = Future()
+    done.set_result(jpeg)
+    return done
