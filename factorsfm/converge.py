@@ -19,6 +19,7 @@ logger = logging.getLogger(__name__)
 
 _DOUBTFUL_INFLATION = 3.5  # sound solutions have 1 to 4; a doubt costs no more than time
 _CLEARLY = 0.9  # of the cost of the incremental map's solution, at which another start is preferred
+_SETTLED = 0.8  # of the scale that a solution assumed, below which its errors ask for another round
 _CORE_TRACKS = 400  # tracks with which the cameras converge first
 
 
@@ -59,12 +60,18 @@ def _solve_core(part: State, few: Observations, options: Options) -> BundleAdjus
     sigma = max(FIRST_SIGMA_PX, coordinate_sigma(errors))
     adjustment = BundleAdjustment(part, few, replace(o, iterations=20, tolerance=1e-3), sigma=sigma)
     adjustment.solve()
-    sigma = min(sigma, coordinate_sigma(adjustment.reprojection_errors()))
-    adjustment = BundleAdjustment(adjustment.state, few, o, sigma=sigma)
-    adjustment.solve()
+    iterations, measured = adjustment.iterations, coordinate_sigma(adjustment.reprojection_errors())
+    while True:
+        # A wide kernel averages over outliers and lets go early: what it finds counts once the kernel fits the errors.
+        sigma = min(sigma, measured)
+        adjustment = BundleAdjustment(adjustment.state, few, o, sigma=sigma)
+        adjustment.solve()
+        iterations, measured = iterations + adjustment.iterations, coordinate_sigma(adjustment.reprojection_errors())
+        if measured > _SETTLED * sigma:
+            break
+    logger.debug("cameras: %d iterations, %.3f px", iterations, measured)
     adjustment.state = in_front(adjustment.state)
-    logger.debug("cameras: %d iterations, %.3f px", adjustment.iterations, sigma)
-    adjustment.sigma = coordinate_sigma(adjustment.reprojection_errors())
+    adjustment.sigma = measured
     return adjustment
 
 
