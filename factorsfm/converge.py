@@ -23,26 +23,21 @@ _SETTLED = 0.8  # of the scale that a solution assumed, below which its errors a
 _CORE_TRACKS = 400  # tracks with which the cameras converge first
 
 
-def converge_cameras(
-    state: State, observations: Observations, options: Options
-) -> tuple[Index, Observations, BundleAdjustment]:
-    """All cameras on the core tracks: the points, their observations, the solution.
+def converge_cameras(start: State, few: Observations, options: Options) -> BundleAdjustment:
+    """All cameras on the core tracks.
 
     Residuals that are large, or repeat themselves for many frames, say that the solution is not one: the incremental
     map may have been bent or depth-reversed beyond repair. Other starts are tried then, and the best fit is kept.
     """
-    core = _core(observations, len(state.rotation), _CORE_TRACKS)
-    few = observations.of(core)
-    part = replace(state, bearing=state.bearing[core], inverse_distance=state.inverse_distance[core])
-    best = _solve_core(part, few, options)
+    best = _solve_core(start, few, options)
     if (
         best.sigma > options.polish.doubtful_px
         or temporal_inflation(best.reprojection_vectors(), few) > _DOUBTFUL_INFLATION
     ):
         logger.info("the solution does not fit (%.2f px), trying other starts", best.sigma)
-        best = _better(best, _solve_core(_flat(part, few, options.polish), few, options))
+        best = _better(best, _solve_core(_flat(start, few, options.polish), few, options))
         best = _better(best, _solve_core(_reversed(best.state), few, options))
-    return core, few, best
+    return best
 
 
 def _better(known: BundleAdjustment, other: BundleAdjustment) -> BundleAdjustment:
@@ -100,7 +95,7 @@ def _reversed(part: State) -> State:
     return replace(part, translation=-part.translation, inverse_distance=inverse)
 
 
-def _core(observations: Observations, frames: int, count: int) -> Index:
+def core_tracks(observations: Observations, frames: int, count: int = _CORE_TRACKS) -> Index:
     """Points that hold the cameras together: the longest tracks, but enough of them in every frame."""
     length = np.bincount(observations.point)
     order = np.argsort(-length, kind="stable")

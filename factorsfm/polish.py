@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from factorsfm.control import LocatedControl
 from factorsfm.controlled import controlled, frames_under_control
-from factorsfm.converge import converge_cameras
+from factorsfm.converge import converge_cameras, core_tracks
 from factorsfm.evaluation.alignment import Similarity
 from factorsfm.images import MappedImage, gather
-from factorsfm.lens import Lens, LensEstimate, estimate_lens, through
+from factorsfm.lens import Lens, LensEstimate, estimate_lens
 from factorsfm.marginals import in_scene_unit
 from factorsfm.noise import FIRST_SIGMA_PX, SMALLEST_SIGMA_PX, block_inflation
 from factorsfm.observability import Motion, camera_observability, classify_motion, pose_blocks
@@ -24,7 +24,7 @@ from factorsfm.problem import Observations, State
 from factorsfm.reconstruction import CameraObservability, ControlFit, ShotKind
 from factorsfm.refinement import BundleAdjustment
 from factorsfm.registration import register_image
-from factorsfm.triangulation import triangulate
+from factorsfm.triangulation import Triangulation, triangulate
 from factorsfm.zoom import find_zoom
 
 Array = NDArray[np.float64]
@@ -101,10 +101,12 @@ def polish(
     used = [images[i] for i in frames]
     observations, tracks = _gather(used, min(o.min_track_length, max(2, len(used))))
     groups = np.zeros(len(images), np.int64) if groups is None else groups
-    state = _first_guess(used, observations, tracks, map_points, focal, groups[frames])
 
     progress("polish: cameras")
-    core, few, adjustment = converge_cameras(state, observations, options)
+    core = core_tracks(observations, len(frames))
+    few = observations.of(core)
+    start = _first_guess(used, few, tracks[core], map_points, focal, groups[frames])
+    adjustment = converge_cameras(start, few, options)
     lens = None
     if options.refine_focal_length:
         guess = Lens(focal, np.zeros(4) if shape is None else shape)
@@ -117,7 +119,6 @@ def polish(
                 (_between(lens, frames, np.arange(len(images))), np.arange(len(images))) if zooms else (lens, groups)
             )
             control = replace(control, marks=whole.renormalize(control.marks, of_image))
-        state = through(replace(state, log_focal=np.log(lens.guess.focal), group=group), lens.lens.focal)
     motion = classify_motion(adjustment, few, o)
     inflation = block_inflation(adjustment.reprojection_vectors(), few)
     weighed = None
@@ -131,7 +132,7 @@ def polish(
 
     progress("polish: points")
     sigma = adjustment.sigma
-    state = _with_part(state, part, core)
+    state = _with_all_points(part, adjustment.state, observations, core)
     state = BundleAdjustment(state, observations, replace(o, iterations=4), sigma=sigma, points_only=True).solve()
     if o.observation_sigmas is None:
         observations, tracks, state = _without_outliers(state, observations, tracks, sigma, o)
@@ -244,34 +245,49 @@ def _first_guess(
     bearing[mapped] = points[at] / distance[at, None]
     inverse[mapped] = 1.0 / np.maximum(distance[at] * unit, 1e-3)
     if not mapped.all():
-        views = np.unique(np.linspace(0, len(images) - 1, _TRIANGULATION_VIEWS).astype(int))
-        few = np.isin(observations.frame, views)
-        first_of_track = np.zeros(len(few), bool)
-        first_of_track[np.searchsorted(observations.point, np.arange(len(tracks)))] = True
-        keep = few | first_of_track
-        some = Observations(observations.frame[keep], observations.point[keep], observations.xy[keep])
         new = np.nonzero(~mapped)[0]
-        result = triangulate(
-            turn,
-            translation,
-            some.of(new),
-            focal=float(np.median(focal)),
-            inlier_px=5.0,
-            sigma=FIRST_SIGMA_PX,
-            fallback=np.ones(len(new)),
-        )
+        cameras = State(turn, translation, bearing[:0], inverse[:0], np.log(focal), group=group)
+        result = _triangulated(cameras, observations, new, np.ones(len(new)))
         bearing[new], inverse[new] = result.bearing, result.inverse_distance
     inverse = np.clip(inverse, 0.02, 20.0)
     return State(turn, translation, bearing, inverse, np.log(focal), group=group)
 
 
+def _triangulated(cameras: State, observations: Observations, points: Index, fallback: Array) -> Triangulation:
+    """Some points from a few views each, spread over their tracks; `fallback` as in `triangulate`."""
+    o = observations.of(points)
+    start = np.searchsorted(o.point, np.arange(len(points)))
+    length = np.diff(np.append(start, len(o.point)))[o.point]
+    place = np.arange(len(o.point)) - start[o.point]
+    spaced = place * _TRIANGULATION_VIEWS // length > (place - 1) * _TRIANGULATION_VIEWS // length
+    few = spaced | (place == length - 1)
+    return triangulate(
+        cameras.rotation,
+        cameras.translation,
+        Observations(o.frame[few], o.point[few], o.xy[few]),
+        focal=float(np.median(cameras.focal)),
+        inlier_px=5.0,
+        sigma=FIRST_SIGMA_PX,
+        fallback=fallback,
+    )
+
+
 # --- stages -----------------------------------------------------------------------------------------------------
 
 
-def _with_part(state: State, part: State, core: Index) -> State:
-    """The cameras and core points of `part`, the other points of `state`."""
-    bearing, inverse = state.bearing.copy(), state.inverse_distance.copy()
+def _with_all_points(part: State, solved: State, observations: Observations, core: Index) -> State:
+    """The cameras and core points of `part`, and the other points triangulated from the cameras as `solved`.
+
+    What the map said of the others is as wrong as the map was, and in another unit.
+    """
+    count = int(observations.point[-1]) + 1
+    bearing, inverse = np.empty((count, 3)), np.empty(count)
     bearing[core], inverse[core] = part.bearing, part.inverse_distance
+    others = np.setdiff1d(np.arange(count), core)
+    if len(others):
+        typical = float(np.median(solved.inverse_distance))
+        new = _triangulated(solved, observations, others, np.full(len(others), typical))
+        bearing[others], inverse[others] = new.bearing, np.clip(new.inverse_distance, 0.02 * typical, 20.0 * typical)
     return replace(part, bearing=bearing, inverse_distance=inverse)
 
 
