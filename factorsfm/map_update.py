@@ -163,17 +163,46 @@ def _add_landmarks(copy: MapCopy, window: list[MappedImage], guidance: DepthGuid
     if room < o.landmarks // 10 or not candidates.any():
         return
     chosen = _spread(newest.tracks.xy, known, np.nonzero(candidates)[0], room)
-    ids = np.sort(newest.tracks.ids[chosen])
-    affine, prior = guidance.at_observations(window, ids)
+    _add_points(copy.points, window, newest, np.sort(newest.tracks.ids[chosen]), guidance, copy.focal)
+
+
+def add_tracks(
+    points: PointMap, images: Sequence[MappedImage], near: MappedImage, ids: Index, options: MapperOptions, focal: float
+) -> int:
+    """Points for tracks that registered images see, keyframes or not, until the graph knows better; their number.
+
+    Args:
+        points: the map to which they are added.
+        images: registered; near: one of them; ids: those of its tracks that are wanted.
+        focal: pixels.
+    """
+    seen, count = np.unique(np.concatenate([image.tracks.ids for image in images]), return_counts=True)
+    ids = np.intersect1d(ids, seen[count >= 2])
+    ids = ids[~points.contains(ids)]
+    return _add_points(points, images, near, ids, DepthGuidance(options, points), focal) if len(ids) else 0
+
+
+def _add_points(
+    points: PointMap,
+    images: Sequence[MappedImage],
+    near: MappedImage,
+    ids: Index,
+    guidance: DepthGuidance,
+    focal: float,
+) -> int:
+    """Triangulate tracks of `near` (ascending) from all images, and add what they agree on to the map."""
+    o = guidance.options
+    affine, prior = guidance.at_observations(images, ids)
     result = triangulate(
-        np.array([image.rotation for image in window]),
-        np.array([image.translation for image in window]),
-        gather(window, ids),
-        focal=copy.focal, inlier_px=o.inlier_px, sigma=o.pixel_sigma,
-        fallback=guidance.fallback(newest, ids), affine=affine, prior=prior,
+        np.array([image.rotation for image in images]),
+        np.array([image.translation for image in images]),
+        gather(images, ids),
+        focal=focal, inlier_px=o.inlier_px, sigma=o.pixel_sigma,
+        fallback=guidance.fallback(near, ids), affine=affine, prior=prior,
     )  # fmt: skip
     good = (result.inliers >= 2) & (result.inverse_distance > _FARTHEST)
-    copy.points.set(ids[good], result.bearing[good] / result.inverse_distance[good, None])
+    points.set(ids[good], result.bearing[good] / result.inverse_distance[good, None])
+    return int(good.sum())
 
 
 def _problem(

@@ -17,7 +17,7 @@ from factorsfm.factors import camera_points, cross_matrices
 from factorsfm.graph import FactorGraph
 from factorsfm.images import ImageTracks, MappedImage, median_flow, renormalize, shared_tracks
 from factorsfm.initialization import NoStart, Start
-from factorsfm.map_update import MapCopy, MapUpdate, update_map
+from factorsfm.map_update import MapCopy, MapUpdate, add_tracks, update_map
 from factorsfm.options import Options
 from factorsfm.point_map import PointMap
 from factorsfm.reconstruction import FrameStatus
@@ -40,6 +40,7 @@ _PATIENCE, _YOUNG_KEYFRAMES = 5, 2  # images that do not join a map, and its key
 _RUNNING_OUT = 0.5  # share of an image's tracks with a point, below which the map is extended at once
 _CONSENSUS = 0.8  # share of the inliers of the image before that is enough, however roughly they agree
 _SETTLED, _SETTLED_DELAY = 5, 2  # keyframes of a map that changes little; frames that it waits longer for the graph
+_REACH = 60  # images to both sides of a lost one from which its tracks are triangulated
 _LEAST_SHARED = 0.7  # of the tracks of the last keyframe; with fewer, a new one is made
 
 
@@ -148,6 +149,8 @@ class Mapper:
         if hurry:  # the camera is faster than the graph
             self._take_over()
         self._register(image)
+        if not image.registered and self._map_tracks(image):
+            self._register(image)
         if image.registered and self._update is None and self._is_keyframe(image):
             self._add_keyframe(image, read_depth)
             if hurry:
@@ -158,6 +161,7 @@ class Mapper:
         if not self.started:
             self._begin(self._starter.last_resort(self._waiting(), self.focal))
         self.refresh()
+        self._take_up_lost()
         self.close()
 
     def close(self) -> None:
@@ -173,6 +177,35 @@ class Mapper:
                 self._register(image)
                 if image.status is not FrameStatus.REGISTERED:
                     image.status, image.message = known
+
+    def _take_up_lost(self) -> None:
+        """Register what the map had lost, or not reached yet, from its ends and gaps on: backwards, then forwards."""
+        if not self.started:
+            return
+        found = True
+        while found:
+            found = False
+            for image in itertools.chain(reversed(self.images), self.images):
+                if image.registered or image.status not in _NOT_JOINED:
+                    continue
+                known = image.status, image.message
+                self._map_tracks(image)
+                self._register(image)
+                if image.registered:
+                    found = True
+                else:
+                    image.status, image.message = known
+
+    def _map_tracks(self, image: MappedImage) -> bool:
+        """Points for the tracks that an image without a pose shares with registered ones; whether there are any."""
+        position = image.tracks.position
+        around = self.images[max(0, position - _REACH) : position + _REACH + 1]
+        registered = [other for other in around if other.registered]
+        if not registered:
+            return False
+        near = min(registered, key=lambda other: abs(other.tracks.position - position))
+        shared = np.intersect1d(near.tracks.ids, image.tracks.ids, assume_unique=True)
+        return add_tracks(self.points, registered, near, shared, self.options, self.focal) > 0
 
     # --- start --------------------------------------------------------------------------------------------------
 
