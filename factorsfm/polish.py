@@ -132,7 +132,7 @@ def polish(
 
     progress("polish: points")
     sigma = adjustment.sigma
-    state = _with_all_points(part, adjustment.state, observations, core)
+    state = with_all_points(part, adjustment.state, observations, core)
     state = BundleAdjustment(state, observations, replace(o, iterations=4), sigma=sigma, points_only=True).solve()
     if o.observation_sigmas is None:
         observations, tracks, state = _without_outliers(state, observations, tracks, sigma, o)
@@ -275,7 +275,7 @@ def _triangulated(cameras: State, observations: Observations, points: Index, fal
 # --- stages -----------------------------------------------------------------------------------------------------
 
 
-def _with_all_points(part: State, solved: State, observations: Observations, core: Index) -> State:
+def with_all_points(part: State, solved: State, observations: Observations, core: Index) -> State:
     """The cameras and core points of `part`, and the other points triangulated from the cameras as `solved`.
 
     What the map said of the others is as wrong as the map was, and in another unit.

@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 from estimation_problems import angles_between, in_unit_of, make_problem
 
-from factorsfm.converge import in_front
+from factorsfm.converge import converge_cameras, in_front
 from factorsfm.images import MappedImage
 from factorsfm.initialization import ImageTracks
 from factorsfm.options import Options
-from factorsfm.polish import polish
+from factorsfm.polish import polish, with_all_points
+from factorsfm.problem import Observations
 from factorsfm.reconstruction import FrameStatus, ShotKind
+from factorsfm.refinement import BundleAdjustment
 
 
 def images_of(problem, state):
@@ -82,3 +84,37 @@ def test_a_long_shot_registers_the_frames_between_on_the_polished_points():
     assert result.covariance.shape == (12, 6, 6)
     assert angles_between(result.state.rotation, problem.truth.rotation).max() < 1e-3
     assert np.median(result.errors) == pytest.approx(0.118, rel=0.2)
+
+
+def test_the_tracks_outside_the_core_follow_the_cameras_in_whatever_unit():
+    problem = make_problem("truck", frames=12, points=200, parallax=0.1)
+    o, truth = problem.observations, problem.truth
+    core = np.arange(0, len(truth.bearing), 2)
+    short = (o.point % 2 == 1) & (o.frame >= 4)  # the others are seen later, and by fewer
+    seen = Observations(o.frame[~short], o.point[~short], o.xy[~short])
+    unit = 0.01
+    solved = replace(
+        truth,
+        translation=truth.translation / unit,
+        bearing=truth.bearing[core],
+        inverse_distance=unit * truth.inverse_distance[core],
+    )
+    state = with_all_points(solved, solved, seen, core)
+    np.testing.assert_allclose(state.bearing, truth.bearing, atol=1e-6)
+    np.testing.assert_allclose(state.inverse_distance, unit * truth.inverse_distance, rtol=1e-3)
+    np.testing.assert_array_equal(state.translation, solved.translation)
+
+
+def test_a_solution_under_a_wide_kernel_is_solved_again():
+    problem = make_problem("truck", frames=12, points=200, parallax=0.05, noise_px=0.05)
+    rng = np.random.default_rng(3)
+    seen = problem.observations
+    wrong = rng.random(len(seen.xy)) < 0.1  # single observations that are elsewhere
+    xy = seen.xy + wrong[:, None] * rng.normal(0.0, 5.0 / problem.focal, seen.xy.shape)
+    seen = replace(seen, xy=xy)
+    options = Options.preset_named("geometry")
+    best = converge_cameras(problem.truth, seen, options)
+    found = converge_cameras(bent(problem.truth), seen, options)
+    costs = [BundleAdjustment(b.state, seen, options.polish, sigma=0.05).cost() for b in (best, found)]
+    assert costs[1] == pytest.approx(costs[0], rel=0.01)
+    assert found.sigma == pytest.approx(0.05, rel=0.3)
