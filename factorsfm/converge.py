@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.noise import FIRST_SIGMA_PX, coordinate_sigma, temporal_inflation
+from factorsfm.noise import FIRST_SIGMA_PX, block_inflation, coordinate_sigma
 from factorsfm.options import Options, PolishOptions
 from factorsfm.problem import Observations, State
 from factorsfm.refinement import BundleAdjustment
@@ -17,7 +17,7 @@ Index = NDArray[np.int64]
 
 logger = logging.getLogger(__name__)
 
-_DOUBTFUL_INFLATION = 3.5  # sound solutions have 1 to 4; a doubt costs no more than time
+_DOUBTFUL_INFLATION = 8.0  # of blocks of the image and of time; sound solutions have 1 to 6, false ones 13 to 80
 _CLEARLY = 0.9  # of the cost of the incremental map's solution, at which another start is preferred
 _SETTLED = 0.8  # of the scale that a solution assumed, below which its errors ask for another round
 _CORE_TRACKS = 400  # tracks with which the cameras converge first
@@ -26,13 +26,14 @@ _CORE_TRACKS = 400  # tracks with which the cameras converge first
 def converge_cameras(start: State, few: Observations, options: Options) -> BundleAdjustment:
     """All cameras on the core tracks.
 
-    Residuals that are large, or repeat themselves for many frames, say that the solution is not one: the incremental
-    map may have been bent or depth-reversed beyond repair. Other starts are tried then, and the best fit is kept.
+    Residuals that are large, or alike among neighbouring tracks and frames, say that the solution is not one: the
+    incremental map may have been bent or depth-reversed beyond repair. Other starts are tried then, and the best fit
+    is kept. (A single track may well repeat its error for many frames: it slides along what it follows.)
     """
     best = _solve_core(start, few, options)
     if (
         best.sigma > options.polish.doubtful_px
-        or temporal_inflation(best.reprojection_vectors(), few) > _DOUBTFUL_INFLATION
+        or block_inflation(best.reprojection_vectors(), few) > _DOUBTFUL_INFLATION
     ):
         logger.info("the solution does not fit (%.2f px), trying other starts", best.sigma)
         best = _better(best, _solve_core(_flat(start, few, options.polish), few, options))
