@@ -32,6 +32,8 @@ Index = NDArray[np.int64]
 
 logger = logging.getLogger(__name__)
 
+_WELL_HELD = 0.3  # of the largest number of tracks in a frame
+
 
 @dataclass(slots=True)
 class Polished:
@@ -109,7 +111,7 @@ def polish(
         observations, tracks = _gather(used, min(o.min_track_length, max(2, len(used))))
         unheld = _unheld(observations, frames, least)
         if not unheld:
-            state = first_guess(used, observations, tracks, map_points, focal, groups[frames])
+            state = first_guess(used, observations, tracks, map_points, focal, groups[frames], _world(observations))
             guess = Lens(focal, np.zeros(4) if shape is None else shape)
             known = polish_start(state, observations, tracks, used, guess, frames, options, first_focal, progress)
             unheld = _unheld(known.observations, frames, least)
@@ -129,7 +131,7 @@ def polish(
             (_between(lens, frames, np.arange(len(images))), np.arange(len(images))) if zooms else (lens, groups)
         )
         control = replace(control, marks=whole.renormalize(control.marks, of_image))
-    free = known.motion.kind is ShotKind.GENERAL
+    free, state = known.motion.kind is ShotKind.GENERAL, known.state.seen_from(0)
 
     progress("polish: all tracks")
     prior = None
@@ -138,9 +140,9 @@ def polish(
     wide = float(np.sqrt(known.inflation))
     final = replace(o, kernel=o.kernel / wide)
     if known.prior is not None:
-        adjustment, prior = joint_problem(known.state, observations, tracks, used, known.prior, sigma * wide, final)
+        adjustment, prior = joint_problem(state, observations, tracks, used, known.prior, sigma * wide, final)
     else:
-        adjustment = BundleAdjustment(known.state, observations, final, sigma=sigma * wide, free_translation=free)
+        adjustment = BundleAdjustment(state, observations, final, sigma=sigma * wide, free_translation=free)
     adjustment.solve(o.final_iterations)
     if prior is not None:
         prior.residual = adjustment.prior_residuals()
@@ -170,6 +172,12 @@ def polish(
             result.state, result.lens = replace(result.state, log_focal=np.log(lens.lens.focal), group=solved), lens
         _add_frames_between(result, images, registered, group, options)
     return result
+
+
+def _world(observations: Observations) -> int:
+    """The first frame that the tracks hold well: from the others, the way to the solution is long."""
+    count = np.bincount(observations.frame)
+    return int(np.argmax(count >= _WELL_HELD * count.max()))
 
 
 def _unheld(observations: Observations, frames: list[int], least: int) -> dict[int, str]:

@@ -95,10 +95,10 @@ def first_guess(
     map_points: tuple[Index, Array],
     focal: Array,
     group: Index,
+    world: int,
 ) -> State:
-    """Poses in the first camera's frame, points triangulated from a few views, median inverse distance 1."""
-    first = images[0]
-    rotation, origin = first.pose
+    """Poses in the frame of one of the cameras, points triangulated from a few views, median inverse distance 1."""
+    rotation, origin = images[world].pose
     turn = np.array([i.rotation for i in images]) @ rotation.T
     translation = np.array([i.translation for i in images]) - turn @ origin
     ids, points = map_points
@@ -130,7 +130,7 @@ def first_guess(
         )
         bearing[new], inverse[new] = result.bearing, result.inverse_distance
     inverse = np.clip(inverse, 0.02, 20.0)
-    return State(turn, translation, bearing, inverse, np.log(focal), group=group)
+    return State(turn, translation, bearing, inverse, np.log(focal), group=group, world=world)
 
 
 # --- stages -----------------------------------------------------------------------------------------------------------
