@@ -22,12 +22,12 @@ def joined_frames(observations: Observations, frames: int, least: int) -> tuple[
         (frames,) whether each belongs to the set; (frames,) how many of the set's points it observes.
     """
     count = np.bincount(observations.frame, minlength=frames)
-    largest, shared = np.zeros(frames, bool), count
+    largest, shared = np.zeros(frames, bool), np.zeros_like(count)
     left = np.ones(frames, bool)
-    while left.sum() > largest.sum():
+    while left.sum() > max(1, largest.sum()):
         first = int(np.argmax(np.where(left, count, -1)))
         part, seen = _grown(observations, np.arange(frames) == first, least)
-        if part.sum() > largest.sum():
+        if part.sum() > max(1, largest.sum()):
             largest, shared = part, seen
         left &= ~part
     return largest, shared

@@ -122,7 +122,8 @@ def polish(
         registered = [i for i in registered if i not in left_out]
         if len(registered) < 2:
             raise ReconstructionError(
-                f"{len(registered)} frames with {least} observations of points that others see, at least 2 needed"
+                f"{len(registered)} of {len(images)} frames have enough tracks that agree with those of other frames, "
+                "at least 2 needed"
             )
     observations, tracks, sigma, lens = known.observations, known.tracks, known.sigma, known.lens
     if control is not None and lens is not None:
