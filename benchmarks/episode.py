@@ -29,7 +29,7 @@ from factorsfm.evaluation.alignment import pose_arrays
 from factorsfm.evaluation.metrics import trajectory_errors
 from factorsfm.evaluation.truth import Shot
 from factorsfm.reconstruction import Reconstruction
-from factorsfm.threads import available_cores, keep_to_cores
+from factorsfm.threads import available_cores
 
 Image = NDArray[np.uint8]
 
@@ -126,7 +126,7 @@ def run_batch(folder: Path, output: str, network: Path, workers: int, cores: Seq
     if any((folder / "masks").iterdir()):
         command += ["--masks", str(folder / "masks")]
     begin, before = time.perf_counter(), _computing()
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, preexec_fn=partial(keep_to_cores, cores))
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, preexec_fn=partial(os.sched_setaffinity, 0, cores))
     return Batch(workers, len(cores), time.perf_counter() - begin, _computing() - before)
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Sequence
 
 import cv2
 from threadpoolctl import threadpool_limits
@@ -21,12 +20,6 @@ def available_cores() -> list[int]:
     if hasattr(os, "sched_getaffinity"):
         return sorted(os.sched_getaffinity(0))
     return list(range(os.cpu_count() or 1))
-
-
-def keep_to_cores(cores: Sequence[int]) -> None:
-    """Use these cores alone from now on, with all threads and processes that start later; where the system can."""
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, cores)
 
 
 class OneThreadEach(Closing):

@@ -60,10 +60,10 @@ def run(arguments: argparse.Namespace, progress: Progress, show: Show) -> str:
     videos = find_videos(source)
     known = shots_known(output, source)
     method = _method(arguments, several=source.is_dir())
-    workers, scheduler = arguments.workers or len(available_cores()), arguments.scheduler
-    one_thread = scheduler is not None  # its workers do not say how many share a machine
-    with open_crew(min(workers, len(videos)), scheduler) as crew:
-        shots, unread = _find_shots(crew, videos, known, one_thread=one_thread, show=show)
+    most, scheduler = arguments.workers or len(available_cores()), arguments.scheduler
+    workers = min(most, len(videos))
+    with open_crew(workers, scheduler) as crew:
+        shots, unread = _find_shots(crew, videos, known, one_thread=_one_thread(workers, scheduler), show=show)
     jobs = plan_jobs(shots, method, output, several=source.is_dir())
     for job in jobs:
         check_directory(job.folder)
@@ -74,12 +74,20 @@ def run(arguments: argparse.Namespace, progress: Progress, show: Show) -> str:
         if job not in waiting:
             index.add(job)
     index.write()
-    workers = max(1, min(workers, len(waiting)))
+    workers = max(1, min(most, len(waiting)))
     with open_crew(workers, scheduler) as crew:
-        alone = workers == 1 and scheduler is None
-        work = partial(reconstruct_shot, one_thread=one_thread, progress=progress if alone else None)
+        told = progress if workers == 1 and scheduler is None else None
+        work = partial(reconstruct_shot, one_thread=_one_thread(workers, scheduler), progress=told)
         _reconstruct(crew, work, waiting, index, show)
     return _conclusion(index.entries, unread, output)
+
+
+def _one_thread(workers: int, scheduler: str | None) -> bool:
+    """Whether each worker keeps to one thread: where it has no more than a core, others would only wait for it.
+
+    How many share a machine of a cluster is not known here.
+    """
+    return scheduler is not None or len(available_cores()) < 2 * workers
 
 
 def _method(arguments: argparse.Namespace, *, several: bool) -> Method:

@@ -8,11 +8,9 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
 from contextlib import AbstractContextManager, contextmanager
-from multiprocessing.queues import SimpleQueue
 from typing import Any, Generic, TypeVar
 
 from factorsfm.errors import FactorsfmError, InputError
-from factorsfm.threads import available_cores, keep_to_cores
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -94,7 +92,7 @@ def _outcome(future: Future[Result]) -> Result | BaseException:
 
 @contextmanager
 def open_crew(workers: int, scheduler: str | None) -> Iterator[Crew]:
-    """So many processes that share the cores of this machine, this process alone for one, or a Dask cluster's workers.
+    """So many processes of this machine, this process alone for one, or the workers of a Dask scheduler.
 
     Raises:
         InputError: Dask is not installed, or its scheduler does not answer.
@@ -119,11 +117,7 @@ def open_crew(workers: int, scheduler: str | None) -> Iterator[Crew]:
 def _processes(count: int) -> Iterator[Executor]:
     before = set(multiprocessing.active_children())
     # Spawned: the libraries here have threads, and a fork takes none of them along.
-    context = multiprocessing.get_context("spawn")
-    cores, shares = available_cores(), context.SimpleQueue()
-    for worker in range(count):
-        shares.put(cores[worker::count] or [cores[worker % len(cores)]])
-    pool = ProcessPoolExecutor(count, context, _begin, (shares,))
+    pool = ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), _ignore_interrupts)
     try:
         yield pool
     except BaseException:
@@ -134,10 +128,8 @@ def _processes(count: int) -> Iterator[Executor]:
     pool.shutdown()
 
 
-def _begin(shares: SimpleQueue[list[int]]) -> None:
-    """What a process does first: it leaves interrupts to its parent, and the other cores to the others."""
+def _ignore_interrupts() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    keep_to_cores(shares.get())
 
 
 @contextmanager

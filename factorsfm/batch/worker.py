@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 
 from factorsfm import api
 from factorsfm.batch.plan import Job, Video, shots_of
 from factorsfm.errors import FactorsfmError, ReconstructionError
 from factorsfm.export.folder import write_failure, write_folder
-from factorsfm.threads import OneThreadEach, available_cores
+from factorsfm.threads import OneThreadEach
 
 Progress = Callable[[str, int, int | None], None]
 
 
 def find_shots_of(video: Video, *, one_thread: bool) -> list[range]:
-    """Shots of a video; errors as in `plan.shots_of`, `one_thread` as in `reconstruct_shot`."""
-    with _threads(one_thread):
+    """Shots of a video; errors as in `plan.shots_of`."""
+    with OneThreadEach() if one_thread else nullcontext():
         return shots_of(video)
 
 
@@ -25,7 +25,7 @@ def reconstruct_shot(job: Job, *, one_thread: bool, progress: Progress | None = 
     """Write the result of a shot, or why there is none.
 
     Args:
-        one_thread: keep to one thread wherever there are more cores, too: others may use them.
+        one_thread: keep to one thread, where there is no more than a core for each worker.
 
     Raises:
         InputError: the folder cannot be written.
@@ -34,7 +34,7 @@ def reconstruct_shot(job: Job, *, one_thread: bool, progress: Progress | None = 
     method = job.method
     try:
         # A network opened inside keeps to one thread, too, see `priors.networks`.
-        with _threads(one_thread):
+        with OneThreadEach() if one_thread else nullcontext():
             reconstruction = api.reconstruct(
                 job.video.path,
                 camera=method.camera,
@@ -53,8 +53,3 @@ def reconstruct_shot(job: Job, *, one_thread: bool, progress: Progress | None = 
         return
     reconstruction.options["job"] = job.to_dict()
     write_folder(reconstruction, job.folder)
-
-
-def _threads(one: bool) -> AbstractContextManager[object]:
-    """On a single core, several threads of a library would only wait for each other."""
-    return OneThreadEach() if one or len(available_cores()) == 1 else nullcontext()
