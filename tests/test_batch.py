@@ -345,9 +345,7 @@ def test_a_worker_for_every_core_but_not_more_than_shots_and_the_longest_shot_fi
 
     monkeypatch.setattr("factorsfm.batch.command.open_crew", crew)
     monkeypatch.setattr("factorsfm.batch.command.available_cores", lambda: list(range(cores)))
-    monkeypatch.setattr(
-        "factorsfm.batch.command.reconstruct_shot", lambda job, **_: done.append(len(job.frames)) or 1 / 0
-    )
+    monkeypatch.setattr("factorsfm.batch.command.reconstruct_shot", shot)
     monkeypatch.setattr("factorsfm.batch.plan.find_shots", lambda _: [range(2), range(2, 12), range(12, 16)])
     assert main(["batch", str(film), "--output", str(tmp_path / "out"), "--depth", "none"]) == 3
     assert opened == [1, workers]  # one video, then three shots
