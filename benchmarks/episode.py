@@ -147,9 +147,7 @@ def median_ate(reconstruction: Reconstruction, shot: Shot, frames: range) -> flo
 def measure(shots: Sequence[Shot], limit: int | None, network: Path, folder: Path) -> list[str]:
     """The parts of the page."""
     parts = write_film(shots, limit, folder)
-    begin = time.perf_counter()
     found = find_shots(folder / "film.avi")
-    searching = time.perf_counter() - begin
     right = len(found) == len(parts) and all(part.is_found(f) for part, f in zip(parts, found, strict=True))
     numbers = [next(n for n, f in enumerate(found, 1) if part.middle in f) for part in parts]
     cores = available_cores()
@@ -191,7 +189,7 @@ def measure(shots: Sequence[Shot], limit: int | None, network: Path, folder: Pat
         "times as fast as one worker that has one core: the same kind of worker, once and on the whole machine. A "
         "single one with all cores does several things at a time, tracking beside the graph and the decoder, and so "
         f"uses most of them already: {many} workers are {whole.wall / full.wall:.2f} times as fast as that. Start, the "
-        f"search for cuts ({searching:.1f} seconds) and the last shots, which have no company, are included.",
+        "search for cuts and the last shots, which have no company, are included.",
     ]
 
 
