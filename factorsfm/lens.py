@@ -89,9 +89,9 @@ def renormalized(observations: Observations, before: Lens, after: Lens, group: I
 
 
 def through(state: State, focal: Array) -> State:
-    """The state with other focal lengths (g,): points where the first camera sees them, at the depth that they have."""
-    first = state.group[0]
-    stretch = np.exp(state.log_focal[first]) / focal[first]
+    """The state with other focal lengths (g,): points where the world's camera sees them, and as deep as they are."""
+    own = state.group[state.world]
+    stretch = np.exp(state.log_focal[own]) / focal[own]
     bearing = state.bearing * [stretch, stretch, 1.0]
     length = np.linalg.norm(bearing, axis=1)
     return replace(
@@ -206,9 +206,9 @@ def search_focal(adjustment: BundleAdjustment, guess: Lens, options: PolishOptio
 
 
 def _some_frames(state: State, observations: Observations) -> tuple[State, Observations]:
-    """Few frames, evenly spread, and the points that two of them see."""
+    """Few frames, evenly spread, that of the world among them, and the points that two of them see."""
     count = len(state.rotation)
-    frames = np.unique(np.linspace(0, count - 1, min(count, _SEARCH_FRAMES)).astype(int))
+    frames = np.unique([*np.linspace(0, count - 1, min(count, _SEARCH_FRAMES)).astype(int), state.world])
     keep = np.isin(observations.frame, frames)
     seen = np.bincount(observations.point[keep], minlength=len(state.bearing)) >= 2
     keep &= seen[observations.point]
@@ -220,6 +220,7 @@ def _some_frames(state: State, observations: Observations) -> tuple[State, Obser
         bearing=state.bearing[points],
         inverse_distance=state.inverse_distance[points],
         group=state.group[frames],
+        world=int(np.searchsorted(frames, state.world)),
     )
     frame, point = observations.frame[keep], observations.point[keep]
     return part, Observations(
