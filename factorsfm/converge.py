@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.noise import FIRST_SIGMA_PX, coordinate_sigma, temporal_inflation
+from factorsfm.noise import FIRST_SIGMA_PX, coordinate_sigma, image_cells, temporal_inflation
 from factorsfm.options import Options, PolishOptions
 from factorsfm.problem import Observations, State
 from factorsfm.refinement import BundleAdjustment
@@ -20,6 +20,7 @@ logger = logging.getLogger(__name__)
 _DOUBTFUL_INFLATION = 3.5  # sound solutions have 1 to 4; a doubt costs no more than time
 _CLEARLY = 0.9  # of the cost of the incremental map's solution, at which another start is preferred
 _CORE_TRACKS = 400  # tracks with which the cameras converge first
+_CELLS, _CELL_TRACKS = (8, 5), 10  # across and down, and the tracks of each with which an unknown lens is estimated
 
 
 def converge_cameras(
@@ -31,6 +32,8 @@ def converge_cameras(
     map may have been bent or depth-reversed beyond repair. Other starts are tried then, and the best fit is kept.
     """
     core = _core(observations, len(state.rotation), _CORE_TRACKS)
+    if options.refine_focal_length:
+        core = np.union1d(core, _everywhere(observations, _CELL_TRACKS))
     few = observations.of(core)
     part = replace(state, bearing=state.bearing[core], inverse_distance=state.inverse_distance[core])
     best = _solve_core(part, few, options)
@@ -105,3 +108,15 @@ def _core(observations: Observations, frames: int, count: int) -> Index:
     place = np.arange(len(by_frame)) - first[observations.frame[by_frame]]
     chosen[observations.point[by_frame[place < count // 3]]] = True
     return np.nonzero(chosen)[0]
+
+
+def _everywhere(observations: Observations, count: int) -> Index:
+    """Points that show the lens in every part of the image: those seen there longest.
+
+    The longest tracks of a pan cross its middle, and say little of its rim.
+    """
+    o = observations
+    pairs, seen = np.unique(np.stack([image_cells(o.xy, *_CELLS), o.point], 1), axis=0, return_counts=True)
+    cell, point = pairs[np.lexsort((-seen, pairs[:, 0]))].T
+    place = np.arange(len(cell)) - np.searchsorted(cell, cell)
+    return np.unique(point[place < count])
