@@ -25,6 +25,7 @@ logger = logging.getLogger(__name__)
 _FIELDS_OF_VIEW = np.radians(np.geomspace(20.0, 100.0, 8))  # across the longer side of what the tracks fill
 _SEARCH_FRAMES, _SEARCH_ITERATIONS, _PARABOLAS = 24, 15, 3
 _TOLERANCE = 1e-5  # the focal length lies along a flat valley
+_OPEN_FOCAL_STD = 0.02  # like `FOCAL_STD`, with what a distortion that is not believed leaves open
 _DISTORTION_SIGMA = 0.1
 _CENTER_SIGMA = 0.02  # of the width
 _LARGEST_RATIO = 4.0  # of the focal length to its guess
@@ -137,6 +138,7 @@ def estimate_lens(
             motion.rotation_only, best.observations, o, best.sigma, np.zeros(4), moves=False, focal_prior=focal_prior
         )
     std, _ = _standard_deviations(best)
+    known = float(std[:groups].max()) < FOCAL_STD
     if sigmas.any():
         full = solved_with_lens(
             best.state, best.observations, o, best.sigma, sigmas, moves=moves, focal_prior=focal_prior
@@ -150,15 +152,16 @@ def estimate_lens(
         wide = _LEAST_DISPLACEMENT * width * float(np.median(full.state.focal))
         usable = full_std[:groups].max() < FOCAL_STD and bool(np.isfinite(full.observations.xy).all())
         if evidence > _LEAST_EVIDENCE and displacement > wide and usable:
-            best, std = full, full_std
+            best, std, known = full, full_std, True
         else:  # a distortion that is not believed may be there all the same: second moment around what is kept
             moved = full.state.log_focal - best.state.log_focal
+            known &= float(np.hypot(full_std[:groups], moved).max()) < _OPEN_FOCAL_STD
             std[:groups] = np.fmax(std[:groups], np.hypot(full_std[:groups], moved))
     lens, focal_std, shape_std = Lens(np.exp(best.state.log_focal), best.state.lens), std[:groups], std[groups:]
     logger.info("focal length %s pixels within %s %%, guess %s", lens.focal, 100 * focal_std, guess.focal)
     misfit = best.sigma if best.sigma > _MISFIT * o.doubtful_px else 0.0
     far = np.abs(np.log(lens.focal / guess.focal)).max() > np.log(_LARGEST_RATIO)
-    if misfit or far or not focal_std.max() < FOCAL_STD:
+    if misfit or far or not known:
         kept = Lens(guess.focal if fallback is None else fallback, guess.shape)
         adjustment = BundleAdjustment(
             through(adjustment.state, kept.focal),

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from factorsfm.errors import InputError
 
-FOCAL_STD = 0.02  # relative standard deviation, distortion being open, up to which a focal length counts as determined
+FOCAL_STD = 0.015  # relative standard deviation up to which a focal length counts as determined
 
 LensFreedom = Literal["auto", "fixed", "focal", "distortion", "all", "zoom"]
 DepthUse = Literal["none", "paper", "inverse"]
