@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.noise import FIRST_SIGMA_PX, block_inflation, coordinate_sigma
+from factorsfm.noise import FIRST_SIGMA_PX, block_inflation, coordinate_sigma, image_cells
 from factorsfm.options import Options, PolishOptions
 from factorsfm.problem import Observations, State
 from factorsfm.refinement import BundleAdjustment
@@ -21,6 +21,7 @@ _DOUBTFUL_INFLATION = 8.0  # of blocks of the image and of time; sound solutions
 _CLEARLY = 0.9  # of the cost of the incremental map's solution, at which another start is preferred
 _SETTLED = 0.8  # of the scale that a solution assumed, below which its errors ask for another round
 _CORE_TRACKS = 400  # tracks with which the cameras converge first
+_CELLS, _CELL_TRACKS = (8, 5), 10  # across and down, and the tracks of each with which an unknown lens is estimated
 
 
 def converge_cameras(start: State, few: Observations, options: Options) -> BundleAdjustment:
@@ -96,15 +97,32 @@ def _reversed(part: State) -> State:
     return replace(part, translation=-part.translation, inverse_distance=inverse)
 
 
-def core_tracks(observations: Observations, frames: int, count: int = _CORE_TRACKS) -> Index:
-    """Points that hold the cameras together: the longest tracks, but enough of them in every frame."""
+def core_tracks(observations: Observations, frames: int, *, everywhere: bool = False) -> Index:
+    """Points that hold the cameras together: the longest tracks, but enough of them in every frame.
+
+    Args:
+        frames: how many there are; everywhere: enough of them in every part of the image, too, for the lens.
+    """
     length = np.bincount(observations.point)
     order = np.argsort(-length, kind="stable")
     rank = np.empty(len(order), int)
     rank[order] = np.arange(len(order))
-    chosen = rank < count
+    chosen = rank < _CORE_TRACKS
     by_frame = np.lexsort((rank[observations.point], observations.frame))
     first = np.searchsorted(observations.frame[by_frame], np.arange(frames))
     place = np.arange(len(by_frame)) - first[observations.frame[by_frame]]
-    chosen[observations.point[by_frame[place < count // 3]]] = True
-    return np.nonzero(chosen)[0]
+    chosen[observations.point[by_frame[place < _CORE_TRACKS // 3]]] = True
+    core = np.nonzero(chosen)[0]
+    return np.union1d(core, _everywhere(observations, _CELL_TRACKS)) if everywhere else core
+
+
+def _everywhere(observations: Observations, count: int) -> Index:
+    """Points that show the lens in every part of the image: those seen there longest.
+
+    The longest tracks of a pan cross its middle, and say little of its rim.
+    """
+    o = observations
+    pairs, seen = np.unique(np.stack([image_cells(o.xy, *_CELLS), o.point], 1), axis=0, return_counts=True)
+    cell, point = pairs[np.lexsort((-seen, pairs[:, 0]))].T
+    place = np.arange(len(cell)) - np.searchsorted(cell, cell)
+    return np.unique(point[place < count])

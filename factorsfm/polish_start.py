@@ -70,7 +70,7 @@ def polish_start(
     """
     o = options.polish
     progress("polish: cameras")
-    core = core_tracks(observations, len(images))
+    core = core_tracks(observations, len(images), everywhere=options.refine_focal_length)
     few = observations.of(core)
     start = _first_guess(images, few, tracks[core], map_points, guess.focal, group, _world(observations))
     adjustment = converge_cameras(start, few, options)
