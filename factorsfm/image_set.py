@@ -356,7 +356,8 @@ class ImageSet:
             notes.append(f"{len(missing)} of {len(result.frames)} images could not be registered ({some}).")
         twins = [photo for photo in self.photos if photo.twin is not None and not photo.left_out]
         if twins:
-            notes.append(f"{len(twins)} images repeat others, the first one is {twins[0].name}.")
+            some = ", ".join(photo.name for photo in twins[:5]) + (", …" if len(twins) > 5 else "")
+            notes.append(f"The same as other images, whose poses they share: {some}.")
         return self.notes + notes
 
     def _failure(self, message: str, images: list[MappedImage]) -> ReconstructionError:
