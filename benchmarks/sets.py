@@ -303,17 +303,17 @@ def _plot(records: list[dict[str, Any]]) -> None:
 
 def real_cases() -> list[Case]:
     """The photographs and the videos."""
-    both = (True, False)
-    wide = [Case(n, m, known) for n in UNORDERED for known in both for m in ("COLMAP", "sift")]
-    wide += [Case(n, "xfeat") for n in UNORDERED]
-    narrow = [
+    lenses = (True, False)
+    wide = [Case(n, m, known) for n in UNORDERED for known in lenses for m in ("COLMAP", "sift")]
+    small = [
         Case(n, m, known)
         for n in KITCHEN
-        for known in both
-        for m in (*COLMAP, "sift", "sift+prior", "xfeat")
-        if known or m not in ("COLMAP tuned", "xfeat")
+        for known in lenses
+        for m in (*COLMAP, "sift", "sift+prior")
+        if known or m != "COLMAP tuned"
     ]
-    return wide + narrow + [Case(n, m) for n in VIDEOS for m in (*COLMAP, "sift+prior")]
+    videos = [Case(n, m) for n in VIDEOS for m in (*COLMAP, "sift+prior")]
+    return wide + small + videos + [Case(n, "xfeat") for n in (*UNORDERED, *KITCHEN)]
 
 
 def main() -> None:
