@@ -61,10 +61,10 @@ def pyramid_score(xy: Array, mapped: NDArray[np.bool_]) -> int:
     """
     low, extent = xy.min(0), np.maximum(np.ptp(xy, axis=0), 1e-9)
     place = np.clip((xy[mapped] - low) / extent, 0.0, 1.0 - 1e-9)
-    occupied = np.zeros((_FINEST_CELLS, _FINEST_CELLS), bool)
+    occupied: NDArray[np.bool_] = np.zeros((_FINEST_CELLS, _FINEST_CELLS), bool)
     occupied[tuple((place * _FINEST_CELLS).astype(np.int64).T)] = True
     score = 0
     while (cells := len(occupied)) > 1:
         score += cells * int(occupied.sum())
-        occupied = occupied.reshape(cells // 2, 2, cells // 2, 2).any(axis=(1, 3))
+        occupied = np.asarray(occupied.reshape(cells // 2, 2, cells // 2, 2).any(axis=(1, 3)))
     return score

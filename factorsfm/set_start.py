@@ -80,7 +80,7 @@ def _start_from_depth(
     if options.initialization == "essential" or not lifted:
         return NoStart("no image has a usable depth map")
     a, b = np.unravel_index(int(np.argmax(common[lifted])), (len(lifted), len(tracks)))
-    pair = [tracks[lifted[a]], tracks[b]]
+    pair = [tracks[lifted[a]], tracks[int(b)]]
     return start_pair(pair, options.min_tracks, focal=focal, sigma=SIGMA_PX, inlier_px=options.inlier_px)
 
 
