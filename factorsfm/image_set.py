@@ -356,8 +356,8 @@ class ImageSet:
             notes.append(f"{len(missing)} of {len(result.frames)} images could not be registered ({some}).")
         twins = [photo for photo in self.photos if photo.twin is not None and not photo.left_out]
         if twins:
-            some = ", ".join(photo.name for photo in twins[:5]) + (", …" if len(twins) > 5 else "")
-            notes.append(f"The same as other images, whose poses they share: {some}.")
+            some = ", ".join(f"{photo.name} (as {self.photos[photo.twin or 0].name})" for photo in twins[:5])
+            notes.append(f"Images that repeat another one have its pose: {some}{', …' if len(twins) > 5 else ''}.")
         return self.notes + notes
 
     def _failure(self, message: str, images: list[MappedImage]) -> ReconstructionError:

@@ -339,7 +339,7 @@ def test_odd_files_are_told_and_do_not_stop_the_rest(
     text = "\n".join(result.notes)
     assert "2 cameras: 10 of 400x300 pixels" in text
     assert "1 of 300x300 pixels with a focal length of 322 (a guess)" in text
-    for word in ("notes.txt", "cut.jpg", "text.jpg", "large.png", "ztree.png", "flat.png"):
+    for word in ("notes.txt", "cut.jpg", "text.jpg", "large.png", "ztree.png (as tree.png)", "flat.png"):
         assert word in text
     assert result.camera.width == 400
     assert (result.observation_xy < [400, 300]).all()
