@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.burn_ins import contradicts, resting
 from factorsfm.noise import FIRST_SIGMA_PX, coordinate_sigma, temporal_inflation
 from factorsfm.options import Options, PolishOptions
 from factorsfm.problem import Observations, State
@@ -32,8 +33,15 @@ def converge_cameras(
     """
     core = _core(observations, len(state.rotation), _CORE_TRACKS)
     few = observations.of(core)
-    part = replace(state, bearing=state.bearing[core], inverse_distance=state.inverse_distance[core])
+    part = _points_of(state, core)
     best = _solve_core(part, few, options)
+    kept = ~resting(few, float(np.median(state.focal)))
+    if not kept.all():
+        others = np.nonzero(kept)[0]
+        alone = _solve_core(_points_of(part, others), few.of(others), options)
+        if contradicts(best, alone, kept):
+            logger.info("%d of %d points rest in the image and are left out", (~kept).sum(), len(kept))
+            core, few, part, best = core[others], alone.observations, _points_of(part, others), alone
     if (
         best.sigma > options.polish.doubtful_px
         or temporal_inflation(best.reprojection_vectors(), few) > _DOUBTFUL_INFLATION
@@ -42,6 +50,10 @@ def converge_cameras(
         best = _better(best, _solve_core(_flat(part, few, options.polish), few, options))
         best = _better(best, _solve_core(_reversed(best.state), few, options))
     return core, few, best
+
+
+def _points_of(state: State, points: Index) -> State:
+    return replace(state, bearing=state.bearing[points], inverse_distance=state.inverse_distance[points])
 
 
 def _better(known: BundleAdjustment, other: BundleAdjustment) -> BundleAdjustment:

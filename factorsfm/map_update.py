@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.burn_ins import contradicts, resting
 from factorsfm.graph import FactorGraph, UpdateResult
 from factorsfm.guidance import DepthGuidance
 from factorsfm.images import MappedImage, gather, shared_tracks, state_of
@@ -32,6 +33,7 @@ _HELD_KEYFRAMES = 8  # constant ones that take part, with what they saw
 _LEAST_SHARED = 30  # landmarks by which a constant keyframe takes part
 _GROSS = 4.0  # times the threshold of an inlier: a young map is wrong, too, and long tracks are precious
 _YOUNG_ITERATIONS = 20  # divided by the number of keyframes
+_SUSPICION_ITERATIONS = 20  # enough to say that what rests in the image fits none
 _SOLVER = replace(PolishOptions(), tolerance=1e-3)
 _LARGEST_SIGMA_PX = 3.0
 _ALIKE = 20.0  # tracks that count as one: the errors of neighbours are alike
@@ -54,6 +56,7 @@ class MapUpdate:
         poses, affines, covariances: of the keyframes that moved, by position.
         outliers: tracks of the new keyframe whose point is elsewhere.
         focal: a better focal length (pixels), None where it stays as it is.
+        burn_ins: tracks of what is laid over the images.
     """
 
     position: int
@@ -68,6 +71,7 @@ class MapUpdate:
     covariances: dict[int, Array] = field(default_factory=dict)
     outliers: Index = field(default_factory=lambda: np.zeros(0, np.int64))
     focal: float | None = None
+    burn_ins: Index = field(default_factory=lambda: np.zeros(0, np.int64))
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +108,10 @@ def update_map(copy: MapCopy, graph: FactorGraph, read_depth: Callable[[], Image
     if (seen := int(np.isin(newest.tracks.ids, ids).sum())) < o.min_inliers:
         return MapUpdate(position, depth, False, f"{seen} of {o.min_inliers} needed landmarks in the keyframe")
     observations = gather(window, ids)
+    burn_ins = _burn_ins(copy, window, held, ids, observations)
+    if len(burn_ins):
+        ids = np.setdiff1d(ids, burn_ins)
+        observations = gather(window, ids)
     adjustment, rows = _problem(copy, window, held, ids, observations)
     positions = [image.tracks.position for image in window]
     guided = [positions[row] for row in rows]
@@ -113,7 +121,26 @@ def update_map(copy: MapCopy, graph: FactorGraph, read_depth: Callable[[], Image
     if not result.committed:
         return MapUpdate(position, depth, False, result.reason)
     focal = _better_focal(adjustment, held) if copy.refine_focal and len(copy.keyframes) >= _LENS_KEYFRAMES else None
-    return _judged(copy, adjustment, window, held, ids, guided, result, focal)
+    update = _judged(copy, adjustment, window, held, ids, guided, result, focal)
+    return replace(update, removed=np.union1d(update.removed, burn_ins), burn_ins=burn_ins) if len(burn_ins) else update
+
+
+def _burn_ins(
+    copy: MapCopy,
+    window: list[MappedImage],
+    held: NDArray[np.bool_],
+    ids: Index,
+    observations: Observations,
+) -> Index:
+    """Tracks that rest in the image and contradict the others."""
+    kept = ~resting(observations, copy.focal)
+    if kept.all():
+        return np.zeros(0, np.int64)
+    together, _ = _problem(copy, window, held, ids, observations)
+    alone, _ = _problem(copy, window, held, ids[kept], observations.of(np.nonzero(kept)[0]))
+    for adjustment in (together, alone):
+        adjustment.solve(_SUSPICION_ITERATIONS)
+    return ids[~kept] if contradicts(together, alone, kept) else np.zeros(0, np.int64)
 
 
 def _better_focal(adjustment: BundleAdjustment, held: NDArray[np.bool_]) -> float | None:

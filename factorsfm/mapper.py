@@ -60,6 +60,7 @@ class Mapper:
         self.images: list[MappedImage] = []
         self.keyframes: list[int] = []
         self.outliers = np.zeros(0, np.int64)  # tracks that the last image showed to be wrong
+        self.burn_ins = np.zeros(0, np.int64)  # tracks that it showed to be laid over the image
         self.new_points = 0  # that came with the last image
         self.parallax = 0.0  # largest so far
         self.graph = FactorGraph()
@@ -125,7 +126,7 @@ class Mapper:
         if self._advanced == len(self.images):
             return
         self._advanced = len(self.images)
-        self.outliers = np.zeros(0, np.int64)
+        self.outliers = self.burn_ins = np.zeros(0, np.int64)
         self.new_points = 0
         if self._update is not None and len(self.images) >= self._due:
             self._take_over()
@@ -401,6 +402,7 @@ class Mapper:
         for position, affine in update.affines.items():
             self.images[position].affine = affine
         self.outliers = update.outliers
+        self.burn_ins = np.union1d(self.burn_ins, update.burn_ins)
         self._carry(update.position, before)
         if update.focal is not None:
             self._set_focal(update.focal)

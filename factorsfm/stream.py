@@ -144,6 +144,7 @@ class Stream(Closing):
         self._pixels.append(pixels)
         self._thumbnails.add(frame.image)
         self._tracker.drop(mapper.outliers)
+        self._tracker.avoid(mapper.burn_ins)
         with self._timed("relocalization"):
             self._keep_in_sight(image, grey, pixels)
         if image.status is not FrameStatus.WAITING:  # it may still take part in the start

@@ -21,7 +21,7 @@ from factorsfm.options import TrackerOptions
 from factorsfm.tracks.local_motion import LocalMotion
 from factorsfm.tracks.patches import Array, BirthPatches, Image, in_parts
 
-_STATE = ("_texture", "_frame", "_replenished", "_next_id", "_ids", "_xy", "_velocity", "_ended")
+_STATE = ("_texture", "_frame", "_replenished", "_next_id", "_ids", "_xy", "_velocity", "_ended", "_avoided")
 BLANK_TEXTURE = 0.2  # grey levels
 _MOST_ENDED = 3000  # tracks that are remembered
 _REVIVAL_REACH = 2.0  # times that of a re-alignment: where a track should be is known less well
@@ -72,6 +72,7 @@ class FlowTracker:
         self._xy = np.zeros((0, 2), np.float32)
         self._velocity = np.zeros((0, 2), np.float32)
         self._motion: LocalMotion | None = None  # into the present frame
+        self._avoided = np.zeros((0, 2), np.float32)  # places where no track may start
         self._patches = BirthPatches(options.window_px)
         self._window = (options.window_px, options.window_px)
         self._just_ended: list[tuple[NDArray[np.int64], BirthPatches]] = []
@@ -112,6 +113,13 @@ class FlowTracker:
         """End tracks that the mapper found to be outliers."""
         if len(ids):
             self._keep(~np.isin(self._ids, ids))
+
+    def avoid(self, ids: NDArray[np.int64]) -> None:
+        """End tracks of what is laid over the images, and start none in these places again."""
+        gone = np.isin(self._ids, ids)
+        if gone.any():
+            self._avoided = np.r_[self._avoided, self._xy[gone]]
+            self._keep(~gone)
 
     @property
     def ended(self) -> NDArray[np.int64]:
@@ -283,6 +291,8 @@ class FlowTracker:
         radius = max(2, round(0.4 * (w * h / o.max_tracks) ** 0.5))
         for x, y in (0.5 * self._xy - 0.25).round().astype(int).tolist():
             cv2.circle(free, (x, y), radius, 0, -1)
+        for x, y in (0.5 * self._avoided - 0.25).round().astype(int).tolist():
+            cv2.circle(free, (x, y), o.window_px // 2, 0, -1)
         corners = cv2.goodFeaturesToTrack(frame.half, 0, o.corner_quality, radius, mask=free, blockSize=3)
         if corners is None:
             return 0
