@@ -21,7 +21,18 @@ from factorsfm.options import TrackerOptions
 from factorsfm.tracks.local_motion import LocalMotion
 from factorsfm.tracks.patches import Array, BirthPatches, Image, in_parts
 
-_STATE = ("_texture", "_frame", "_replenished", "_next_id", "_ids", "_xy", "_velocity", "_ended", "_avoided")
+_STATE = (
+    "_texture",
+    "_frame",
+    "_replenished",
+    "_interrupted",
+    "_next_id",
+    "_ids",
+    "_xy",
+    "_velocity",
+    "_ended",
+    "_avoided",
+)
 BLANK_TEXTURE = 0.2  # grey levels
 _MOST_ENDED = 3000  # tracks that are remembered
 _REVIVAL_REACH = 2.0  # times that of a re-alignment: where a track should be is known less well
@@ -29,6 +40,8 @@ _SCOUTS = 64  # tracks that tell how the camera's motion has changed
 _FIT_STEPS, _FIT_RIDGE = 5, 1e-4
 _SURPRISE_PX, _SURPRISE_RATIO = 0.5, 3.0  # distance from the predicted place; and times that of the others
 _GRID = 24  # cells along the longer image side, from which new corners are taken in turn
+_LEVELS = np.arange(256)
+_EXPOSURE_CHANGE = 4.0  # mean change of the grey levels between frames, with which it is made good
 _CHECK_INTERVAL = 2  # frames: the way back of an alignment is tried in turn
 _REPLENISH_INTERVAL, _FEW = 3, 0.7  # frames between looking for corners, unless so small a share of the tracks is left
 _BLANK_SHARE = 0.2  # of the texture of the last frame; with less, a frame among others is black or a flash
@@ -202,6 +215,7 @@ class FlowTracker:
     def _step(self, previous: _Frame, frame: _Frame, mask: NDArray[np.bool_] | None) -> None:
         """Align the patches where their tracks should be; search in the frame before for those that are not there."""
         o, old, n, grey = self.options, self._xy, len(self._ids), frame.full
+        previous = _exposed_as(previous, frame)
         start = self._predicted(previous, frame)
         checked = (self._ids + self._frame) % _CHECK_INTERVAL == 0
         new, ok = self._patches.align(
@@ -333,6 +347,16 @@ def _halved(grey: Image) -> Image:
     return np.asarray(
         cv2.resize(grey[: h // 2 * 2, : w // 2 * 2], (w // 2, h // 2), interpolation=cv2.INTER_AREA), np.uint8
     )
+
+
+def _exposed_as(previous: _Frame, frame: _Frame) -> _Frame:
+    """The frame before with the exposure of the present one: grey levels that have the same rank."""
+    counts, target = (np.bincount(f.half.ravel(), minlength=256) for f in (previous, frame))
+    levels = np.interp(np.cumsum(counts) / counts.sum(), np.cumsum(target) / target.sum(), _LEVELS)
+    if counts @ np.abs(levels - _LEVELS) < _EXPOSURE_CHANGE * counts.sum():
+        return previous
+    table = np.rint(levels).astype(np.uint8)
+    return _Frame(*(np.asarray(cv2.LUT(image, table), np.uint8) for image in previous))
 
 
 def image_texture(grey: Image) -> float:
