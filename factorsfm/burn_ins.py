@@ -16,10 +16,10 @@ from factorsfm.noise import coordinate_sigma
 from factorsfm.problem import Observations
 from factorsfm.refinement import BundleAdjustment
 
-_MOVED_PX = 4.0  # typical displacement of the others, from which something may be said to rest ...
+_MOVED_PX = 2.0  # typical displacement of the others, from which something may be said to rest ...
 _RESTS = 0.15  # ... and the share of it by which that may seem to move: its surroundings are in its window
 _LEAST, _LEAST_SHARE = 8, 0.03  # points: fewer do no harm
-_CONTRADICTS = 0.9  # of the cost of the others' observations, if they are explained alone
+_CONTRADICTS = 0.95  # of the cost of the others' observations, if they are explained alone
 
 
 def resting(observations: Observations, focal: float) -> NDArray[np.bool_]:
@@ -38,19 +38,18 @@ def resting(observations: Observations, focal: float) -> NDArray[np.bool_]:
     least = max(_LEAST, _LEAST_SHARE * len(start))
     rows = np.argsort(o.frame, kind="stable")
     by_frame = np.split(rows, np.searchsorted(o.frame[rows], np.arange(1, last.max() + 1)))
-    for frame in np.unique(first[suspects]) if len(suspects) >= least else ():
+    for frame in np.unique(first[suspects]).tolist() if len(suspects) >= least else ():
         seen = np.full((len(start), 2), np.nan)
         seen[o.point[by_frame[frame]]] = o.xy[by_frame[frame]]
         born = suspects[first[suspects] == frame]
-        interval = 1
-        while frame + interval <= last[born].max():
-            there = by_frame[frame + interval]
+        end = int(last[born].max())
+        for later in sorted({min(frame + 2**k, end) for k in range((end - frame).bit_length() + 1)}):
+            there = by_frame[later]
             shift = np.linalg.norm(o.xy[there] - seen[o.point[there]], axis=1)
             shift = shift[np.isfinite(shift)]
-            lasting = born[last[born] >= frame + interval]
+            lasting = born[last[born] >= later]
             if len(shift):
                 expected[lasting] = np.maximum(expected[lasting], np.median(shift))
-            interval *= 2
     found = (focal * expected > _MOVED_PX) & (reach < _RESTS * expected)
     return np.asarray(found & (found.sum() >= least))
 
