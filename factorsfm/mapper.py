@@ -250,7 +250,7 @@ class Mapper:
         near = image if image.registered else self._nearest_registered(tracks.position)
         depth = None
         if o.registration_depth != "none" and tracks.depth is not None:
-            depth = _select(tracks.depth, mapped)
+            depth = tracks.depth.of(mapped)
         result = register_image(
             self.points.at(tracks.ids[mapped]),
             tracks.xy[mapped],
@@ -430,7 +430,3 @@ class Mapper:
                 relative = turn @ before[0].T
                 image.rotation = relative @ rotation
                 image.translation = relative @ (translation - before[1]) + shift
-
-
-def _select(depth: ImageDepth, index: NDArray[np.bool_]) -> ImageDepth:
-    return replace(depth, inverse_depth=depth.inverse_depth[index], reliability=depth.reliability[index])
