@@ -25,7 +25,6 @@ _STATE = (
     "_texture",
     "_frame",
     "_replenished",
-    "_interrupted",
     "_next_id",
     "_ids",
     "_xy",
