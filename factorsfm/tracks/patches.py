@@ -17,7 +17,8 @@ Rows = NDArray[np.intp]
 _SUPPORT = 22  # half side of a stored patch: the window at half the birth's scale, with its margin
 _MARGIN = 1  # of a warped patch around the window: interpolation and derivative
 _STALE_PX = 0.05  # change of the map at the edge of the window with which a patch is warped again
-_EXPOSURE_CHANGE = 2.0  # grey levels, of the typical patch; without one it is 0.5 to 1.4
+_EXPOSURE_CHANGE = 4.0  # grey levels, of the typical patch; without one it is up to 1.2, in fast motion more ...
+_LOCAL_CHANGE = 8.0  # ... and its size, which a wrong prediction changes as well
 _MOST_GAIN = 4.0  # of the contrast, between a patch and the image
 _STOP = cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS
 _FINE = (_STOP, 20, 0.01)
@@ -171,7 +172,8 @@ def _lit_as(tiles: Image, grey: Image, xy: Array) -> Image:
     n, side, _ = tiles.shape
     tile, seen = (a.reshape(n, -1).astype(np.float32) for a in (tiles, _cut(grey, xy, side // 2)))
     mean, seen_mean = (a.mean(axis=1, keepdims=True) for a in (tile, seen))
-    if np.median(np.abs(seen_mean - mean)) < _EXPOSURE_CHANGE:
+    change = seen_mean - mean
+    if abs(np.median(change)) < _EXPOSURE_CHANGE and np.median(np.abs(change)) < _LOCAL_CHANGE:
         return tiles
     tile -= mean
     seen -= seen_mean
