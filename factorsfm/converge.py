@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.burn_ins import contradicts, resting
 from factorsfm.noise import FIRST_SIGMA_PX, block_inflation, coordinate_sigma, image_cells
 from factorsfm.options import Options, PolishOptions
 from factorsfm.problem import Observations, State
@@ -24,14 +25,21 @@ _CORE_TRACKS = 400  # tracks with which the cameras converge first
 _CELLS, _CELL_TRACKS = (8, 5), 10  # across and down, and the tracks of each with which an unknown lens is estimated
 
 
-def converge_cameras(start: State, few: Observations, options: Options) -> BundleAdjustment:
-    """All cameras on the core tracks.
+def converge_cameras(start: State, few: Observations, options: Options) -> tuple[Index, BundleAdjustment]:
+    """All cameras on the core tracks: which points are kept, and the solution.
 
     Residuals that are large, or alike among neighbouring tracks and frames, say that the solution is not one: the
     incremental map may have been bent or depth-reversed beyond repair. Other starts are tried then, and the best fit
     is kept. (A single track may well repeat its error for many frames: it slides along what it follows.)
     """
-    best = _solve_core(start, few, options)
+    kept, best = np.arange(len(start.bearing)), _solve_core(start, few, options)
+    rests = resting(few, float(np.median(start.focal)))
+    if rests.any():
+        others = np.nonzero(~rests)[0]
+        alone = _solve_core(_points_of(start, others), few.of(others), options)
+        if contradicts(best, alone, ~rests):
+            logger.info("%d of %d points rest in the image and are left out", rests.sum(), len(rests))
+            kept, start, few, best = others, _points_of(start, others), alone.observations, alone
     if (
         best.sigma > options.polish.doubtful_px
         or block_inflation(best.reprojection_vectors(), few) > _DOUBTFUL_INFLATION
@@ -39,7 +47,11 @@ def converge_cameras(start: State, few: Observations, options: Options) -> Bundl
         logger.info("the solution does not fit (%.2f px), trying other starts", best.sigma)
         best = _better(best, _solve_core(_flat(start, few, options.polish), few, options))
         best = _better(best, _solve_core(_reversed(best.state), few, options))
-    return best
+    return kept, best
+
+
+def _points_of(state: State, points: Index) -> State:
+    return replace(state, bearing=state.bearing[points], inverse_distance=state.inverse_distance[points])
 
 
 def _better(known: BundleAdjustment, other: BundleAdjustment) -> BundleAdjustment:

@@ -32,6 +32,11 @@ class ImageTracks:
     xy: Array
     depth: ImageDepth | None = None
 
+    def of(self, kept: NDArray[np.bool_]) -> ImageTracks:
+        """Some of the n tracks."""
+        depth = self.depth.of(kept) if self.depth is not None else None
+        return ImageTracks(self.position, self.ids[kept], self.xy[kept], depth)
+
 
 @dataclass(slots=True)
 class MappedImage:

@@ -34,6 +34,7 @@ _STATE = (
 )  # fmt: skip
 _DEPTH_PATIENCE = 3  # keyframes without a depth map after which one does without
 _YOUNG_ERROR = 0.8  # relative, of a map that only the prior has shaped; falls with the square of the keyframes
+_SAME_PLACE = 0.02  # of the camera's displacement: keyframes nearer than that tell no more of the map's shape than one
 _LEAST_RELOCALIZED = 0.7  # of the similar corners must agree with the pose; in a whole view nine tenths do
 _NOT_JOINED = (FrameStatus.LOST, FrameStatus.TOO_FEW_INLIERS)
 _PATIENCE, _YOUNG_KEYFRAMES = 5, 2  # images that do not join a map, and its keyframes, with which it is given up
@@ -61,6 +62,7 @@ class Mapper:
         self.images: list[MappedImage] = []
         self.keyframes: list[int] = []
         self.outliers = np.zeros(0, np.int64)  # tracks that the last image showed to be wrong
+        self.burn_ins = np.zeros(0, np.int64)  # tracks that it showed to be laid over the image
         self.new_points = 0  # that came with the last image
         self.parallax = 0.0  # largest so far
         self.graph = FactorGraph()
@@ -126,7 +128,7 @@ class Mapper:
         if self._advanced == len(self.images):
             return
         self._advanced = len(self.images)
-        self.outliers = np.zeros(0, np.int64)
+        self.outliers = self.burn_ins = np.zeros(0, np.int64)
         self.new_points = 0
         if self._update is not None and len(self.images) >= self._due:
             self._take_over()
@@ -281,7 +283,7 @@ class Mapper:
         near = image if image.registered else self._nearest_registered(tracks.position)
         depth = None
         if o.registration_depth != "none" and tracks.depth is not None:
-            depth = _select(tracks.depth, mapped)
+            depth = tracks.depth.of(mapped)
         result = register_image(
             self.points.at(tracks.ids[mapped]),
             tracks.xy[mapped],
@@ -365,7 +367,7 @@ class Mapper:
         rotation, translation = image.pose
         solved = [k for k in self.keyframes if self.images[k].covariance is not None]
         # What linearised covariances do not know of a young map: that its whole shape is still a guess.
-        bent = _YOUNG_ERROR * float(np.linalg.norm(translation)) / max(len(solved), 1) ** 2
+        bent = _YOUNG_ERROR * float(np.linalg.norm(translation)) / self._places(solved, -rotation.T @ translation) ** 2
         on_map = on_map + bent**2 * np.eye(6)
         if len(solved) < 2:
             return on_map
@@ -377,6 +379,14 @@ class Mapper:
         adjoint[:3, :3] = adjoint[3:, 3:] = turn
         adjoint[3:, :3] = cross_matrices(shift[None])[0] @ turn
         return on_map + adjoint @ keyframe.covariance @ adjoint.T
+
+    def _places(self, keyframes: list[int], center: Array) -> int:
+        """From how many places keyframes have seen the scene, on the scale of the move to `center`; at least 1."""
+        centers = np.array(
+            [-rotation.T @ translation for rotation, translation in (self.images[k].pose for k in keyframes)]
+        )
+        steps = np.linalg.norm(np.diff(centers, axis=0), axis=1) if len(centers) > 1 else np.zeros(0)
+        return 1 + int((steps > _SAME_PLACE * np.linalg.norm(center)).sum())
 
     # --- keyframes and landmarks --------------------------------------------------------------------------------
 
@@ -434,6 +444,7 @@ class Mapper:
         for position, affine in update.affines.items():
             self.images[position].affine = affine
         self.outliers = update.outliers
+        self.burn_ins = np.union1d(self.burn_ins, update.burn_ins)
         self._carry(update.position, before)
         if update.focal is not None:
             self._set_focal(update.focal)
@@ -452,7 +463,3 @@ class Mapper:
                 relative = turn @ before[0].T
                 image.rotation = relative @ rotation
                 image.translation = relative @ (translation - before[1]) + shift
-
-
-def _select(depth: ImageDepth, index: NDArray[np.bool_]) -> ImageDepth:
-    return replace(depth, inverse_depth=depth.inverse_depth[index], reliability=depth.reliability[index])

@@ -73,8 +73,8 @@ def polish_start(
     core = core_tracks(observations, len(images), everywhere=options.refine_focal_length)
     few = observations.of(core)
     start = _first_guess(images, few, tracks[core], map_points, guess.focal, group, _world(observations))
-    adjustment = converge_cameras(start, few, options)
-    lens = None
+    kept, adjustment = converge_cameras(start, few, options)
+    core, few, lens = core[kept], adjustment.observations, None
     if options.refine_focal_length:
         adjustment, lens = _estimate_lens(adjustment, guess, frames, options, first_focal)
         few = adjustment.observations

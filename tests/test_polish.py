@@ -116,8 +116,8 @@ def test_a_solution_under_a_wide_kernel_is_solved_again():
     xy = seen.xy + wrong[:, None] * rng.normal(0.0, 5.0 / problem.focal, seen.xy.shape)
     seen = replace(seen, xy=xy)
     options = Options.preset_named("geometry")
-    best = converge_cameras(problem.truth, seen, options)
-    found = converge_cameras(bent(problem.truth), seen, options)
+    _, best = converge_cameras(problem.truth, seen, options)
+    _, found = converge_cameras(bent(problem.truth), seen, options)
     costs = [BundleAdjustment(b.state, seen, options.polish, sigma=0.05).cost() for b in (best, found)]
     assert costs[1] == pytest.approx(costs[0], rel=0.01)
     assert found.sigma == pytest.approx(0.05, rel=0.3)
