@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import resource
 import shlex
 import subprocess
 import sys
@@ -11,6 +12,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from pathlib import Path
 
@@ -27,6 +29,7 @@ from factorsfm.evaluation.alignment import pose_arrays
 from factorsfm.evaluation.metrics import trajectory_errors
 from factorsfm.evaluation.truth import Shot
 from factorsfm.reconstruction import Reconstruction
+from factorsfm.threads import available_cores
 
 Image = NDArray[np.uint8]
 
@@ -106,15 +109,31 @@ def _dimmed(image: Image, light: float) -> Image:
     return np.asarray(cv2.convertScaleAbs(image, alpha=light), np.uint8)
 
 
-def run_batch(folder: Path, output: str, network: Path, workers: int) -> float:
-    """Wall time of the command, seconds."""
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """A run of the command: processes, cores that they may use; seconds on the wall, and of all cores."""
+
+    workers: int
+    cores: int
+    wall: float
+    computing: float
+
+
+def run_batch(folder: Path, output: str, network: Path, workers: int, cores: Sequence[int]) -> Batch:
+    """Run the command on some cores."""
     command = [sys.executable, "-m", "factorsfm", "batch", str(folder / "film.avi"), "--output", str(folder / output)]
     command += ["--depth", str(network), "--workers", str(workers)]
     if any((folder / "masks").iterdir()):
         command += ["--masks", str(folder / "masks")]
-    begin = time.perf_counter()
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-    return time.perf_counter() - begin
+    begin, before = time.perf_counter(), _computing()
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, preexec_fn=partial(os.sched_setaffinity, 0, cores))
+    return Batch(workers, len(cores), time.perf_counter() - begin, _computing() - before)
+
+
+def _computing() -> float:
+    """Seconds that all cores have spent on processes started from here that have ended."""
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return usage.ru_utime + usage.ru_stime
 
 
 def median_ate(reconstruction: Reconstruction, shot: Shot, frames: range) -> float:
@@ -131,35 +150,46 @@ def measure(shots: Sequence[Shot], limit: int | None, network: Path, folder: Pat
     found = find_shots(folder / "film.avi")
     right = len(found) == len(parts) and all(part.is_found(f) for part, f in zip(parts, found, strict=True))
     numbers = [next(n for n, f in enumerate(found, 1) if part.middle in f) for part in parts]
-    one, two = (run_batch(folder, f"workers {n}", network, n) for n in (1, 2))
+    cores = available_cores()
+    many = len(cores)
+    alone, whole, full = (
+        run_batch(folder, f"workers {n} of {len(some)}", network, n, some)
+        for n, some in ((1, cores[:1]), (1, cores), (many, cores))
+    )
     rows: list[list[object]] = []
     ratios = []
     for number, part in zip(numbers, parts, strict=True):
         single = reconstruct(part.shot.source, depth=network, masks=part.shot.masks, frames=slice(0, len(part.frames)))
-        alone = median_ate(single, part.shot, range(len(part.frames)))
-        ate = [_batch_ate(folder / f"workers {n}" / "film" / f"shot_{number:03d}", part) for n in (1, 2)]
-        ratios.append(ate[1] / alone)
+        own = median_ate(single, part.shot, range(len(part.frames)))
+        ate = [
+            _batch_ate(folder / f"workers {b.workers} of {b.cores}" / "film" / f"shot_{number:03d}", part)
+            for b in (whole, full)
+        ]
+        ratios.append(ate[1] / own)
         spans = [f"{span.start} to {span.stop - 1}" for span in (part.frames, found[number - 1])]
-        rows.append([part.shot.name, *spans, *(f"{1e3 * value:.2f}" for value in (alone, *ate)), f"{ratios[-1]:.2f}"])
-    frames = sum(len(part.frames) for part in parts)
+        rows.append([part.shot.name, *spans, *(f"{1e3 * value:.2f}" for value in (own, *ate)), f"{ratios[-1]:.2f}"])
+    frames, runs = sum(len(part.frames) for part in parts), (alone, whole, full)
     return [
         "## Shots",
         f"Boundaries, {'all' if right else 'NOT all'} as they are: at cuts to the frame, at fades within the "
         f"{_FADE} frames that hold the shot's first or last image. Median ATE in mm, of a shot that is reconstructed "
-        "from its own file, in the film by one worker, and by two. The film is coded without loss, but in other "
+        f"from its own file, in the film by one worker, and by {many}. The film is coded without loss, but in other "
         "colours than the files, and a faded shot has some still frames more, so equal numbers are not expected.",
         table(
-            ["shot", "frames", "found", "own file", "one worker", "two workers", "two workers / own file"],
+            ["shot", "frames", "found", "own file", "1 worker", f"{many} workers", f"{many} workers / own file"],
             rows,
         ),
         f"Median ratio **{np.median(ratios):.2f}**.",
         "## Throughput",
         table(
-            ["workers", "seconds", "frames per second"],
-            [[n, f"{s:.1f}", f"{frames / s:.2f}"] for n, s in ((1, one), (2, two))],
+            ["workers", "cores", "seconds", "of computing on all cores", "frames per second"],
+            [[b.workers, b.cores, f"{b.wall:.1f}", f"{b.computing:.1f}", f"{frames / b.wall:.2f}"] for b in runs],
         ),
-        f"Two workers, with a thread each, are **{one / two:.2f} times** as fast as one that has all threads; start, "
-        "search for cuts and the last shot, which has no company, included.",
+        f"{many} workers with a core each, as `batch` starts them by itself, are **{alone.wall / full.wall:.2f}** "
+        "times as fast as one worker that has one core: the same kind of worker, once and on the whole machine. A "
+        "single one with all cores does several things at a time, tracking beside the graph and the decoder, and so "
+        f"uses most of them already: {many} workers are {whole.wall / full.wall:.2f} times as fast as that. Start, the "
+        "search for cuts and the last shots, which have no company, are included.",
     ]
 
 

@@ -131,7 +131,8 @@ def _from_images(
     with work_folder(work) as folder:
         images = ImageSet(folder, camera, depth=depth, masks=masks, features=features, options=options, control=control)
         if isinstance(source, str | Path) and (others := other_files(Path(source))):
-            images.note(f"{len(others)} files that are no images were ignored: {', '.join(others[:5])}.")
+            some = ", ".join(others[:5]) + (", …" if len(others) > 5 else "")
+            images.note(f"Not images, and ignored: {some}.")
         for done, image in enumerate(read_images(source, frames)):
             if progress is not None:
                 progress("images", done, None)

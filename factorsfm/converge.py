@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.noise import FIRST_SIGMA_PX, coordinate_sigma, temporal_inflation
+from factorsfm.burn_ins import contradicts, resting
+from factorsfm.noise import FIRST_SIGMA_PX, block_inflation, coordinate_sigma, image_cells
 from factorsfm.options import Options, PolishOptions
 from factorsfm.problem import Observations, State
 from factorsfm.refinement import BundleAdjustment
@@ -17,31 +18,40 @@ Index = NDArray[np.int64]
 
 logger = logging.getLogger(__name__)
 
-_DOUBTFUL_INFLATION = 3.5  # sound solutions have 1 to 4; a doubt costs no more than time
+_DOUBTFUL_INFLATION = 8.0  # of blocks of the image and of time; sound solutions have 1 to 6, false ones 13 to 80
 _CLEARLY = 0.9  # of the cost of the incremental map's solution, at which another start is preferred
+_SETTLED = 0.8  # of the scale that a solution assumed, below which its errors ask for another round
 _CORE_TRACKS = 400  # tracks with which the cameras converge first
+_CELLS, _CELL_TRACKS = (8, 5), 10  # across and down, and the tracks of each with which an unknown lens is estimated
 
 
-def converge_cameras(
-    state: State, observations: Observations, options: Options
-) -> tuple[Index, Observations, BundleAdjustment]:
-    """All cameras on the core tracks: the points, their observations, the solution.
+def converge_cameras(start: State, few: Observations, options: Options) -> tuple[Index, BundleAdjustment]:
+    """All cameras on the core tracks: which points are kept, and the solution.
 
-    Residuals that are large, or repeat themselves for many frames, say that the solution is not one: the incremental
-    map may have been bent or depth-reversed beyond repair. Other starts are tried then, and the best fit is kept.
+    Residuals that are large, or alike among neighbouring tracks and frames, say that the solution is not one: the
+    incremental map may have been bent or depth-reversed beyond repair. Other starts are tried then, and the best fit
+    is kept. (A single track may well repeat its error for many frames: it slides along what it follows.)
     """
-    core = _core(observations, len(state.rotation), _CORE_TRACKS)
-    few = observations.of(core)
-    part = replace(state, bearing=state.bearing[core], inverse_distance=state.inverse_distance[core])
-    best = _solve_core(part, few, options)
+    kept, best = np.arange(len(start.bearing)), _solve_core(start, few, options)
+    rests = resting(few, float(np.median(start.focal)))
+    if rests.any():
+        others = np.nonzero(~rests)[0]
+        alone = _solve_core(_points_of(start, others), few.of(others), options)
+        if contradicts(best, alone, ~rests):
+            logger.info("%d of %d points rest in the image and are left out", rests.sum(), len(rests))
+            kept, start, few, best = others, _points_of(start, others), alone.observations, alone
     if (
         best.sigma > options.polish.doubtful_px
-        or temporal_inflation(best.reprojection_vectors(), few) > _DOUBTFUL_INFLATION
+        or block_inflation(best.reprojection_vectors(), few) > _DOUBTFUL_INFLATION
     ):
         logger.info("the solution does not fit (%.2f px), trying other starts", best.sigma)
-        best = _better(best, _solve_core(_flat(part, few, options.polish), few, options))
+        best = _better(best, _solve_core(_flat(start, few, options.polish), few, options))
         best = _better(best, _solve_core(_reversed(best.state), few, options))
-    return core, few, best
+    return kept, best
+
+
+def _points_of(state: State, points: Index) -> State:
+    return replace(state, bearing=state.bearing[points], inverse_distance=state.inverse_distance[points])
 
 
 def _better(known: BundleAdjustment, other: BundleAdjustment) -> BundleAdjustment:
@@ -59,12 +69,18 @@ def _solve_core(part: State, few: Observations, options: Options) -> BundleAdjus
     sigma = max(FIRST_SIGMA_PX, coordinate_sigma(errors))
     adjustment = BundleAdjustment(part, few, replace(o, iterations=20, tolerance=1e-3), sigma=sigma)
     adjustment.solve()
-    sigma = min(sigma, coordinate_sigma(adjustment.reprojection_errors()))
-    adjustment = BundleAdjustment(adjustment.state, few, o, sigma=sigma)
-    adjustment.solve()
+    iterations, measured = adjustment.iterations, coordinate_sigma(adjustment.reprojection_errors())
+    while True:
+        # A wide kernel averages over outliers and lets go early: what it finds counts once the kernel fits the errors.
+        sigma = min(sigma, measured)
+        adjustment = BundleAdjustment(adjustment.state, few, o, sigma=sigma)
+        adjustment.solve()
+        iterations, measured = iterations + adjustment.iterations, coordinate_sigma(adjustment.reprojection_errors())
+        if measured > _SETTLED * sigma:
+            break
+    logger.debug("cameras: %d iterations, %.3f px", iterations, measured)
     adjustment.state = in_front(adjustment.state)
-    logger.debug("cameras: %d iterations, %.3f px", adjustment.iterations, sigma)
-    adjustment.sigma = coordinate_sigma(adjustment.reprojection_errors())
+    adjustment.sigma = measured
     return adjustment
 
 
@@ -93,15 +109,32 @@ def _reversed(part: State) -> State:
     return replace(part, translation=-part.translation, inverse_distance=inverse)
 
 
-def _core(observations: Observations, frames: int, count: int) -> Index:
-    """Points that hold the cameras together: the longest tracks, but enough of them in every frame."""
+def core_tracks(observations: Observations, frames: int, *, everywhere: bool = False) -> Index:
+    """Points that hold the cameras together: the longest tracks, but enough of them in every frame.
+
+    Args:
+        frames: how many there are; everywhere: enough of them in every part of the image, too, for the lens.
+    """
     length = np.bincount(observations.point)
     order = np.argsort(-length, kind="stable")
     rank = np.empty(len(order), int)
     rank[order] = np.arange(len(order))
-    chosen = rank < count
+    chosen = rank < _CORE_TRACKS
     by_frame = np.lexsort((rank[observations.point], observations.frame))
     first = np.searchsorted(observations.frame[by_frame], np.arange(frames))
     place = np.arange(len(by_frame)) - first[observations.frame[by_frame]]
-    chosen[observations.point[by_frame[place < count // 3]]] = True
-    return np.nonzero(chosen)[0]
+    chosen[observations.point[by_frame[place < _CORE_TRACKS // 3]]] = True
+    core = np.nonzero(chosen)[0]
+    return np.union1d(core, _everywhere(observations, _CELL_TRACKS)) if everywhere else core
+
+
+def _everywhere(observations: Observations, count: int) -> Index:
+    """Points that show the lens in every part of the image: those seen there longest.
+
+    The longest tracks of a pan cross its middle, and say little of its rim.
+    """
+    o = observations
+    pairs, seen = np.unique(np.stack([image_cells(o.xy, *_CELLS), o.point], 1), axis=0, return_counts=True)
+    cell, point = pairs[np.lexsort((-seen, pairs[:, 0]))].T
+    place = np.arange(len(cell)) - np.searchsorted(cell, cell)
+    return np.unique(point[place < count])

@@ -356,7 +356,8 @@ class ImageSet:
             notes.append(f"{len(missing)} of {len(result.frames)} images could not be registered ({some}).")
         twins = [photo for photo in self.photos if photo.twin is not None and not photo.left_out]
         if twins:
-            notes.append(f"{len(twins)} images repeat others, the first one is {twins[0].name}.")
+            some = ", ".join(f"{photo.name} (as {self.photos[photo.twin or 0].name})" for photo in twins[:5])
+            notes.append(f"Images that repeat another one have its pose: {some}{', …' if len(twins) > 5 else ''}.")
         return self.notes + notes
 
     def _failure(self, message: str, images: list[MappedImage]) -> ReconstructionError:

@@ -32,6 +32,11 @@ class ImageTracks:
     xy: Array
     depth: ImageDepth | None = None
 
+    def of(self, kept: NDArray[np.bool_]) -> ImageTracks:
+        """Some of the n tracks."""
+        depth = self.depth.of(kept) if self.depth is not None else None
+        return ImageTracks(self.position, self.ids[kept], self.xy[kept], depth)
+
 
 @dataclass(slots=True)
 class MappedImage:
@@ -74,13 +79,17 @@ class MappedImage:
 
 def gather(images: Sequence[MappedImage], ids: Index) -> Observations:
     """Observations of some tracks (ascending ids): frames and points are rows of `images` and `ids`."""
+    last = max((int(t[-1]) for t in (ids, *(image.tracks.ids for image in images)) if len(t)), default=-1)
+    row_of = np.full(last + 1, -1)
+    row_of[ids] = np.arange(len(ids))
     frame, point, xy = [], [], []
     for row, image in enumerate(images):
-        seen = np.nonzero(np.isin(image.tracks.ids, ids, assume_unique=True))[0]
-        frame.append(np.full(len(seen), row))
-        point.append(np.searchsorted(ids, image.tracks.ids[seen]))
+        rows = row_of[image.tracks.ids]
+        seen = rows >= 0
+        point.append(rows[seen])
+        frame.append(np.full(len(point[-1]), row))
         xy.append(image.tracks.xy[seen])
-    order = np.lexsort((np.concatenate(frame), np.concatenate(point)))
+    order = np.argsort(np.concatenate(point), kind="stable")
     return Observations(np.concatenate(frame)[order], np.concatenate(point)[order], np.concatenate(xy)[order])
 
 

@@ -25,6 +25,7 @@ logger = logging.getLogger(__name__)
 _FIELDS_OF_VIEW = np.radians(np.geomspace(20.0, 100.0, 8))  # across the longer side of what the tracks fill
 _SEARCH_FRAMES, _SEARCH_ITERATIONS, _PARABOLAS = 24, 15, 3
 _TOLERANCE = 1e-5  # the focal length lies along a flat valley
+_OPEN_FOCAL_STD = 0.02  # like `FOCAL_STD`, with what a distortion that is not believed leaves open
 _DISTORTION_SIGMA = 0.1
 _CENTER_SIGMA = 0.02  # of the width
 _LARGEST_RATIO = 4.0  # of the focal length to its guess
@@ -89,9 +90,9 @@ def renormalized(observations: Observations, before: Lens, after: Lens, group: I
 
 
 def through(state: State, focal: Array) -> State:
-    """The state with other focal lengths (g,): points where the first camera sees them, at the depth that they have."""
-    first = state.group[0]
-    stretch = np.exp(state.log_focal[first]) / focal[first]
+    """The state with other focal lengths (g,): points where the world's camera sees them, and as deep as they are."""
+    own = state.group[state.world]
+    stretch = np.exp(state.log_focal[own]) / focal[own]
     bearing = state.bearing * [stretch, stretch, 1.0]
     length = np.linalg.norm(bearing, axis=1)
     return replace(
@@ -137,6 +138,7 @@ def estimate_lens(
             motion.rotation_only, best.observations, o, best.sigma, np.zeros(4), moves=False, focal_prior=focal_prior
         )
     std, _ = _standard_deviations(best)
+    known = float(std[:groups].max()) < FOCAL_STD
     if sigmas.any():
         full = solved_with_lens(
             best.state, best.observations, o, best.sigma, sigmas, moves=moves, focal_prior=focal_prior
@@ -150,12 +152,16 @@ def estimate_lens(
         wide = _LEAST_DISPLACEMENT * width * float(np.median(full.state.focal))
         usable = full_std[:groups].max() < FOCAL_STD and bool(np.isfinite(full.observations.xy).all())
         if evidence > _LEAST_EVIDENCE and displacement > wide and usable:
-            best, std = full, full_std
+            best, std, known = full, full_std, True
+        else:  # a distortion that is not believed may be there all the same: second moment around what is kept
+            moved = full.state.log_focal - best.state.log_focal
+            known &= float(np.hypot(full_std[:groups], moved).max()) < _OPEN_FOCAL_STD
+            std[:groups] = np.fmax(std[:groups], np.hypot(full_std[:groups], moved))
     lens, focal_std, shape_std = Lens(np.exp(best.state.log_focal), best.state.lens), std[:groups], std[groups:]
     logger.info("focal length %s pixels within %s %%, guess %s", lens.focal, 100 * focal_std, guess.focal)
     misfit = best.sigma if best.sigma > _MISFIT * o.doubtful_px else 0.0
     far = np.abs(np.log(lens.focal / guess.focal)).max() > np.log(_LARGEST_RATIO)
-    if misfit or far or not focal_std.max() < FOCAL_STD:
+    if misfit or far or not known:
         kept = Lens(guess.focal if fallback is None else fallback, guess.shape)
         adjustment = BundleAdjustment(
             through(adjustment.state, kept.focal),
@@ -206,9 +212,9 @@ def search_focal(adjustment: BundleAdjustment, guess: Lens, options: PolishOptio
 
 
 def _some_frames(state: State, observations: Observations) -> tuple[State, Observations]:
-    """Few frames, evenly spread, and the points that two of them see."""
+    """Few frames, evenly spread, that of the world among them, and the points that two of them see."""
     count = len(state.rotation)
-    frames = np.unique(np.linspace(0, count - 1, min(count, _SEARCH_FRAMES)).astype(int))
+    frames = np.unique([*np.linspace(0, count - 1, min(count, _SEARCH_FRAMES)).astype(int), state.world])
     keep = np.isin(observations.frame, frames)
     seen = np.bincount(observations.point[keep], minlength=len(state.bearing)) >= 2
     keep &= seen[observations.point]
@@ -220,6 +226,7 @@ def _some_frames(state: State, observations: Observations) -> tuple[State, Obser
         bearing=state.bearing[points],
         inverse_distance=state.inverse_distance[points],
         group=state.group[frames],
+        world=int(np.searchsorted(frames, state.world)),
     )
     frame, point = observations.frame[keep], observations.point[keep]
     return part, Observations(
@@ -260,37 +267,38 @@ def solved_with_lens(
 def _standard_deviations(adjustment: BundleAdjustment, guess: Array | None = None) -> tuple[Array, float]:
     """(g + 4,) of log focal lengths and shape, NaN where held; and the evidence that the shape is not the guess.
 
-    Of the two covariances the more doubtful one counts.
+    Of the covariances the most doubtful one counts.
     """
     groups = len(adjustment.state.log_focal)
-    formal, pulled = lens_covariances(adjustment)
+    covariances = lens_covariances(adjustment)
     std = np.full(groups + 4, np.nan)
-    std[adjustment.free_lens] = np.sqrt(np.maximum(formal.diagonal(), pulled.diagonal()))
+    std[adjustment.free_lens] = np.sqrt(np.max([c.diagonal() for c in covariances], axis=0))
     evidence = 0.0
     if guess is not None:
         away = (adjustment.state.lens - guess)[adjustment.free_lens[groups:] - groups]
-        evidence = min(float(away @ np.linalg.solve(c[groups:, groups:], away)) for c in (formal, pulled))
+        evidence = min(float(away @ np.linalg.solve(c[groups:, groups:], away)) for c in covariances)
     return std, evidence
 
 
-def lens_covariances(adjustment: BundleAdjustment) -> tuple[Array, Array]:
-    """Covariance of the free ones of log focal lengths and shape, seen in two ways.
+def lens_covariances(adjustment: BundleAdjustment) -> list[Array]:
+    """Covariance of the free ones of log focal lengths and shape, seen in several ways.
 
-    Errors that are alike for a while, or in a part of the image, count as one. How many there are is seen in blocks of
-    residuals, and in the pull of the tracks in each part of the image.
+    Errors that are alike for a while, or in a part of the image, or as long as a track lives, count as one. How many
+    there are is seen in blocks of residuals, and in how differently the parts of the image, and the tracks, pull.
     """
     columns = 6 * len(adjustment.state.rotation) + adjustment.free_lens
     whole, _ = adjustment.covariance(np.zeros(0, np.int64))
     inflation = block_inflation(adjustment.reprojection_vectors(), adjustment.observations)
-    return whole[np.ix_(columns, columns)] * inflation, _pulled_covariance(adjustment, columns)
-
-
-def _pulled_covariance(adjustment: BundleAdjustment, columns: Index) -> Array:
-    """Covariance from how differently the parts of the image pull at some columns."""
     o, influence = adjustment.observations, adjustment.influences(columns)
     xy = np.stack([np.bincount(o.point, o.xy[:, i]) for i in range(2)], -1) / np.bincount(o.point)[:, None]
-    used, key = np.unique(image_cells(xy, *_CELLS), return_inverse=True)
-    pull = np.stack([np.bincount(key, part) for part in influence.T], -1)
+    parts = image_cells(xy, *_CELLS), np.arange(len(xy))
+    return [whole[np.ix_(columns, columns)] * inflation, *(_pulled_covariance(influence, part) for part in parts)]
+
+
+def _pulled_covariance(influence: Array, part: Index) -> Array:
+    """Covariance from how differently groups of points pull; `part`: (n,) group of each point."""
+    used, key = np.unique(part, return_inverse=True)
+    pull = np.stack([np.bincount(key, column) for column in influence.T], -1)
     return np.asarray(pull.T @ pull * (len(used) / max(len(used) - 1, 1)))
 
 

@@ -12,16 +12,18 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.burn_ins import contradicts, resting
 from factorsfm.graph import FactorGraph, UpdateResult
 from factorsfm.guidance import DepthGuidance
 from factorsfm.images import MappedImage, gather, shared_tracks, state_of
+from factorsfm.initialization import lift
 from factorsfm.noise import typical_sigma
 from factorsfm.options import MapperOptions, PolishOptions
 from factorsfm.point_map import PointMap
 from factorsfm.prior_term import joint_problem, usual_prior
 from factorsfm.problem import Observations, State
 from factorsfm.refinement import BundleAdjustment
-from factorsfm.registration import ImageDepth
+from factorsfm.registration import ImageDepth, register_image
 from factorsfm.triangulation import triangulate
 
 Array = NDArray[np.float64]
@@ -31,6 +33,7 @@ _FREE_KEYFRAMES = 20  # that an update solves for; those before are constant
 _HELD_KEYFRAMES = 8  # constant ones that take part, with what they saw
 _LEAST_SHARED = 30  # landmarks by which a constant keyframe takes part
 _GROSS = 4.0  # times the threshold of an inlier: a young map is wrong, too, and long tracks are precious
+_YOUNG_KEYFRAMES = 6  # up to which a map that burn-ins have bent begins again
 _YOUNG_ITERATIONS = 20  # divided by the number of keyframes
 _SOLVER = replace(PolishOptions(), tolerance=1e-3)
 _LARGEST_SIGMA_PX = 3.0
@@ -54,6 +57,7 @@ class MapUpdate:
         poses, affines, covariances: of the keyframes that moved, by position.
         outliers: tracks of the new keyframe whose point is elsewhere.
         focal: a better focal length (pixels), None where it stays as it is.
+        burn_ins: tracks of what is laid over the images.
     """
 
     position: int
@@ -68,6 +72,7 @@ class MapUpdate:
     covariances: dict[int, Array] = field(default_factory=dict)
     outliers: Index = field(default_factory=lambda: np.zeros(0, np.int64))
     focal: float | None = None
+    burn_ins: Index = field(default_factory=lambda: np.zeros(0, np.int64))
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,16 +123,65 @@ def update_map(copy: MapCopy, graph: FactorGraph) -> MapUpdate:
     if (seen := int(np.isin(newest.tracks.ids, ids).sum())) < o.min_inliers:
         return MapUpdate(position, depth, False, f"{seen} of {o.min_inliers} needed landmarks in the keyframe")
     observations = gather(window, ids)
+    burn_ins = _burn_ins(copy, window, held, ids, observations)
+    removed = burn_ins
+    if len(burn_ins):
+        kept = _lifted_anew(copy, window, np.setdiff1d(ids, burn_ins))
+        removed, ids = np.setdiff1d(ids, kept), kept
+        observations = gather(window, ids)
     adjustment, rows = _problem(copy, window, held, ids, observations)
     positions = [image.tracks.position for image in window]
     guided = [positions[row] for row in rows]
-    # A young map has the shape that the prior guessed, and far to go; it is also cheap.
-    iterations = max(o.graph_iterations, _YOUNG_ITERATIONS // len(copy.keyframes))
+    # A young map has the shape that the prior guessed, or that burn-ins gave it, and far to go; it is also cheap.
+    iterations = max(o.graph_iterations, _YOUNG_ITERATIONS // (1 if len(burn_ins) else len(copy.keyframes)))
     result = graph.update(adjustment, positions, guided, iterations)
     if not result.committed:
         return MapUpdate(position, depth, False, result.reason)
     focal = _better_focal(adjustment, held) if copy.refine_focal and len(copy.keyframes) >= _LENS_KEYFRAMES else None
-    return _judged(copy, adjustment, window, held, ids, guided, result, focal)
+    update = _judged(copy, adjustment, window, held, ids, guided, result, focal)
+    return replace(update, removed=np.union1d(update.removed, removed), burn_ins=burn_ins) if len(burn_ins) else update
+
+
+def _burn_ins(
+    copy: MapCopy,
+    window: list[MappedImage],
+    held: NDArray[np.bool_],
+    ids: Index,
+    observations: Observations,
+) -> Index:
+    """Tracks that rest in the image and contradict the others."""
+    kept = ~resting(observations, copy.focal)
+    if kept.all():
+        return np.zeros(0, np.int64)
+    together, _ = _problem(copy, window, held, ids, observations)
+    alone, _ = _problem(copy, window, held, ids[kept], observations.of(np.nonzero(kept)[0]))
+    for adjustment in (together, alone):
+        adjustment.solve(_YOUNG_ITERATIONS)
+    return ids[~kept] if contradicts(together, alone, kept) else np.zeros(0, np.int64)
+
+
+def _lifted_anew(copy: MapCopy, window: list[MappedImage], ids: Index) -> Index:
+    """Bring a young map back to the shape that the prior guessed, and its keyframes to their place on it.
+
+    Returns:
+        Those of its points that are left; all, as they are, where the map is not young or has not begun like that.
+    """
+    first, o = window[0].tracks, copy.options
+    if len(copy.keyframes) > _YOUNG_KEYFRAMES or first.depth is None:
+        return ids
+    points, valid = lift(first.xy, first.depth)
+    good = valid & np.isin(first.ids, ids)
+    seen = [np.isin(first.ids, image.tracks.ids) & good for image in window[1:]]
+    if min(map(np.count_nonzero, seen)) < o.min_inliers:
+        return ids
+    for image, mine in zip(window[1:], seen, strict=True):
+        xy = image.tracks.xy[np.isin(image.tracks.ids, first.ids[mine])]
+        found = register_image(
+            points[mine], xy, *image.pose, focal=copy.focal, sigma=o.pixel_sigma, inlier_px=o.inlier_px
+        )
+        image.rotation, image.translation = found.rotation, found.translation
+    copy.points.set(first.ids[good], points[good])
+    return first.ids[good]
 
 
 def _better_focal(adjustment: BundleAdjustment, held: NDArray[np.bool_]) -> float | None:
@@ -183,17 +237,46 @@ def _add_landmarks(copy: MapCopy, window: list[MappedImage], guidance: DepthGuid
     if room < o.landmarks // 10 or not candidates.any():
         return
     chosen = _spread(newest.tracks.xy, known, np.nonzero(candidates)[0], room)
-    ids = np.sort(newest.tracks.ids[chosen])
-    affine, prior = guidance.at_observations(window, ids)
+    _add_points(copy.points, window, newest, np.sort(newest.tracks.ids[chosen]), guidance, copy.focal)
+
+
+def add_tracks(
+    points: PointMap, images: Sequence[MappedImage], near: MappedImage, ids: Index, options: MapperOptions, focal: float
+) -> int:
+    """Points for tracks that registered images see, keyframes or not, until the graph knows better; their number.
+
+    Args:
+        points: the map to which they are added.
+        images: registered; near: one of them; ids: those of its tracks that are wanted.
+        focal: pixels.
+    """
+    seen, count = np.unique(np.concatenate([image.tracks.ids for image in images]), return_counts=True)
+    ids = np.intersect1d(ids, seen[count >= 2])
+    ids = ids[~points.contains(ids)]
+    return _add_points(points, images, near, ids, DepthGuidance(options, points), focal) if len(ids) else 0
+
+
+def _add_points(
+    points: PointMap,
+    images: Sequence[MappedImage],
+    near: MappedImage,
+    ids: Index,
+    guidance: DepthGuidance,
+    focal: float,
+) -> int:
+    """Triangulate tracks of `near` (ascending) from all images, and add what they agree on to the map."""
+    o = guidance.options
+    affine, prior = guidance.at_observations(images, ids)
     result = triangulate(
-        np.array([image.rotation for image in window]),
-        np.array([image.translation for image in window]),
-        gather(window, ids),
-        focal=copy.focal, inlier_px=o.inlier_px, sigma=o.pixel_sigma,
-        fallback=guidance.fallback(newest, ids), affine=affine, prior=prior,
+        np.array([image.rotation for image in images]),
+        np.array([image.translation for image in images]),
+        gather(images, ids),
+        focal=focal, inlier_px=o.inlier_px, sigma=o.pixel_sigma,
+        fallback=guidance.fallback(near, ids), affine=affine, prior=prior,
     )  # fmt: skip
     good = (result.inliers >= 2) & (result.inverse_distance > _FARTHEST)
-    copy.points.set(ids[good], result.bearing[good] / result.inverse_distance[good, None])
+    points.set(ids[good], result.bearing[good] / result.inverse_distance[good, None])
+    return int(good.sum())
 
 
 def _problem(

@@ -17,7 +17,7 @@ from factorsfm.factors import camera_points, cross_matrices
 from factorsfm.graph_process import GraphProcess
 from factorsfm.images import ImageTracks, MappedImage, median_flow, renormalize, shared_tracks
 from factorsfm.initialization import NoStart, Start
-from factorsfm.map_update import MapCopy, MapUpdate
+from factorsfm.map_update import MapCopy, MapUpdate, add_tracks
 from factorsfm.options import Options
 from factorsfm.point_map import PointMap
 from factorsfm.reconstruction import FrameStatus
@@ -34,12 +34,14 @@ _STATE = (
 )  # fmt: skip
 _DEPTH_PATIENCE = 3  # keyframes without a depth map after which one does without
 _YOUNG_ERROR = 0.8  # relative, of a map that only the prior has shaped; falls with the square of the keyframes
+_SAME_PLACE = 0.02  # of the camera's displacement: keyframes nearer than that tell no more of the map's shape than one
 _LEAST_RELOCALIZED = 0.7  # of the similar corners must agree with the pose; in a whole view nine tenths do
 _NOT_JOINED = (FrameStatus.LOST, FrameStatus.TOO_FEW_INLIERS)
 _PATIENCE, _YOUNG_KEYFRAMES = 5, 2  # images that do not join a map, and its keyframes, with which it is given up
 _RUNNING_OUT = 0.5  # share of an image's tracks with a point, below which the map is extended at once
 _CONSENSUS = 0.8  # share of the inliers of the image before that is enough, however roughly they agree
 _SETTLED, _SETTLED_DELAY = 5, 2  # keyframes of a map that changes little; frames that it waits longer for the graph
+_REACH = 60  # images to both sides of a lost one from which its tracks are triangulated
 _LEAST_SHARED = 0.7  # of the tracks of the last keyframe; with fewer, a new one is made
 
 
@@ -61,6 +63,7 @@ class Mapper:
         self.images: list[MappedImage] = []
         self.keyframes: list[int] = []
         self.outliers = np.zeros(0, np.int64)  # tracks that the last image showed to be wrong
+        self.burn_ins = np.zeros(0, np.int64)  # tracks that it showed to be laid over the image
         self.new_points = 0  # that came with the last image
         self.parallax = 0.0  # largest so far
         self._graph = graph
@@ -125,7 +128,7 @@ class Mapper:
         if self._advanced == len(self.images):
             return
         self._advanced = len(self.images)
-        self.outliers = np.zeros(0, np.int64)
+        self.outliers = self.burn_ins = np.zeros(0, np.int64)
         self.new_points = 0
         if self._update is not None and len(self.images) >= self._due:
             self._take_over()
@@ -148,6 +151,8 @@ class Mapper:
         if hurry:  # the camera is faster than the graph
             self._take_over()
         self._register(image)
+        if not image.registered and self._map_tracks(image):
+            self._register(image)
         if image.registered and self._update is None and self._is_keyframe(image):
             self._add_keyframe(image, read_depth)
             if hurry:
@@ -158,6 +163,7 @@ class Mapper:
         if not self.started:
             self._begin(self._starter.last_resort(self._waiting(), self.focal))
         self.refresh()
+        self._take_up_lost()
         self.close()
 
     def close(self) -> None:
@@ -173,6 +179,35 @@ class Mapper:
                 self._register(image)
                 if image.status is not FrameStatus.REGISTERED:
                     image.status, image.message = known
+
+    def _take_up_lost(self) -> None:
+        """Register what the map had lost, or not reached yet, from its ends and gaps on: backwards, then forwards."""
+        if not self.started:
+            return
+        found = True
+        while found:
+            found = False
+            for image in itertools.chain(reversed(self.images), self.images):
+                if image.registered or image.status not in _NOT_JOINED:
+                    continue
+                known = image.status, image.message
+                self._map_tracks(image)
+                self._register(image)
+                if image.registered:
+                    found = True
+                else:
+                    image.status, image.message = known
+
+    def _map_tracks(self, image: MappedImage) -> bool:
+        """Points for the tracks that an image without a pose shares with registered ones; whether there are any."""
+        position = image.tracks.position
+        around = self.images[max(0, position - _REACH) : position + _REACH + 1]
+        registered = [other for other in around if other.registered]
+        if not registered:
+            return False
+        near = min(registered, key=lambda other: abs(other.tracks.position - position))
+        shared = np.intersect1d(near.tracks.ids, image.tracks.ids, assume_unique=True)
+        return add_tracks(self.points, registered, near, shared, self.options, self.focal) > 0
 
     # --- start --------------------------------------------------------------------------------------------------
 
@@ -248,7 +283,7 @@ class Mapper:
         near = image if image.registered else self._nearest_registered(tracks.position)
         depth = None
         if o.registration_depth != "none" and tracks.depth is not None:
-            depth = _select(tracks.depth, mapped)
+            depth = tracks.depth.of(mapped)
         result = register_image(
             self.points.at(tracks.ids[mapped]),
             tracks.xy[mapped],
@@ -332,7 +367,7 @@ class Mapper:
         rotation, translation = image.pose
         solved = [k for k in self.keyframes if self.images[k].covariance is not None]
         # What linearised covariances do not know of a young map: that its whole shape is still a guess.
-        bent = _YOUNG_ERROR * float(np.linalg.norm(translation)) / max(len(solved), 1) ** 2
+        bent = _YOUNG_ERROR * float(np.linalg.norm(translation)) / self._places(solved, -rotation.T @ translation) ** 2
         on_map = on_map + bent**2 * np.eye(6)
         if len(solved) < 2:
             return on_map
@@ -344,6 +379,14 @@ class Mapper:
         adjoint[:3, :3] = adjoint[3:, 3:] = turn
         adjoint[3:, :3] = cross_matrices(shift[None])[0] @ turn
         return on_map + adjoint @ keyframe.covariance @ adjoint.T
+
+    def _places(self, keyframes: list[int], center: Array) -> int:
+        """From how many places keyframes have seen the scene, on the scale of the move to `center`; at least 1."""
+        centers = np.array(
+            [-rotation.T @ translation for rotation, translation in (self.images[k].pose for k in keyframes)]
+        )
+        steps = np.linalg.norm(np.diff(centers, axis=0), axis=1) if len(centers) > 1 else np.zeros(0)
+        return 1 + int((steps > _SAME_PLACE * np.linalg.norm(center)).sum())
 
     # --- keyframes and landmarks --------------------------------------------------------------------------------
 
@@ -401,6 +444,7 @@ class Mapper:
         for position, affine in update.affines.items():
             self.images[position].affine = affine
         self.outliers = update.outliers
+        self.burn_ins = np.union1d(self.burn_ins, update.burn_ins)
         self._carry(update.position, before)
         if update.focal is not None:
             self._set_focal(update.focal)
@@ -419,7 +463,3 @@ class Mapper:
                 relative = turn @ before[0].T
                 image.rotation = relative @ rotation
                 image.translation = relative @ (translation - before[1]) + shift
-
-
-def _select(depth: ImageDepth, index: NDArray[np.bool_]) -> ImageDepth:
-    return replace(depth, inverse_depth=depth.inverse_depth[index], reliability=depth.reliability[index])

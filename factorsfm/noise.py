@@ -13,7 +13,6 @@ FIRST_SIGMA_PX = 0.25  # of a tracked point, until it is measured
 SMALLEST_SIGMA_PX = 0.03  # no track is better than this
 _RAYLEIGH_MEDIAN = 1.1774  # median of the norm of a 2-D error, in standard deviations
 _BLOCKS = (8, 5, 16)  # across, down, frames: in which errors may be alike
-_LEAST_PAIRS = 100
 
 
 def typical_sigma(errors: Array) -> float:
@@ -24,24 +23,6 @@ def typical_sigma(errors: Array) -> float:
 def coordinate_sigma(errors: Array) -> float:
     """`typical_sigma`, but no better than tracks can be."""
     return max(typical_sigma(errors), SMALLEST_SIGMA_PX)
-
-
-def temporal_inflation(residual: Array, observations: Observations) -> float:
-    """By how much the errors of a track in neighbouring frames repeat each other, as a factor on the variance.
-
-    Args:
-        residual: (m, 2) predicted minus observed position of each observation.
-    """
-    next_one = (np.diff(observations.point) == 0) & (np.diff(observations.frame) == 1)
-    if next_one.sum() < _LEAST_PAIRS:
-        return 1.0
-    inlier = _inliers(residual)
-    pair = np.nonzero(next_one & inlier[:-1] & inlier[1:])[0]
-    a, b = residual[pair], residual[pair + 1]
-    power = float(np.sqrt((a * a).sum() * (b * b).sum()))
-    correlation = float((a * b).sum()) / max(power, 1e-12)
-    correlation = min(max(correlation, 0.0), 0.9)
-    return (1.0 + correlation) / (1.0 - correlation)
 
 
 def block_inflation(residual: Array, observations: Observations) -> float:

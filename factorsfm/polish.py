@@ -11,33 +11,31 @@ from numpy.typing import NDArray
 
 from factorsfm.control import LocatedControl
 from factorsfm.controlled import controlled, frames_under_control
-from factorsfm.converge import converge_cameras
+from factorsfm.errors import ReconstructionError
 from factorsfm.evaluation.alignment import Similarity
 from factorsfm.images import MappedImage, gather
-from factorsfm.lens import Lens, LensEstimate, estimate_lens, through
+from factorsfm.joined import joined_frames
+from factorsfm.lens import Lens, LensEstimate
 from factorsfm.marginals import in_scene_unit
-from factorsfm.noise import FIRST_SIGMA_PX, SMALLEST_SIGMA_PX, block_inflation
-from factorsfm.observability import Motion, camera_observability, classify_motion, pose_blocks
-from factorsfm.options import Options, PolishOptions
-from factorsfm.prior_term import PriorPart, joint_problem, weigh_prior
+from factorsfm.noise import SMALLEST_SIGMA_PX
+from factorsfm.observability import Motion, camera_observability, pose_blocks
+from factorsfm.options import Options
+from factorsfm.polish_start import polish_start
+from factorsfm.prior_term import PriorPart, joint_problem
 from factorsfm.problem import Observations, State
 from factorsfm.reconstruction import CameraObservability, ControlFit, ShotKind
 from factorsfm.refinement import BundleAdjustment
 from factorsfm.registration import register_image
-from factorsfm.triangulation import triangulate
-from factorsfm.zoom import find_zoom
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 logger = logging.getLogger(__name__)
 
-_TRIANGULATION_VIEWS = 10
-
 
 @dataclass(slots=True)
 class Polished:
-    """Result of the polish; the first registered camera is the world, the median inverse distance is about 1.
+    """Result of the polish; the first of its cameras is the world, the median inverse distance is about 1.
 
     Attributes:
         frames: (k,) positions of the images in `state`; tracks: (n,) track of each point.
@@ -45,6 +43,7 @@ class Polished:
         covariance: (k, 6, 6) of the poses, GTSAM's convention, `in_scene_unit`.
         observability: what carries each of them.
         point_std: (n,) standard deviations of the inverse distances, in the same unit.
+        left_out: why, of the registered images that have no pose here.
         lens: what became of an unknown lens, None where it is known.
         datum, control: from this world to that of the control, and what the control did; None without control.
         control_unused: whether there is control that could not take part.
@@ -60,6 +59,7 @@ class Polished:
     covariance: Array
     observability: list[CameraObservability]
     point_std: Array
+    left_out: dict[int, str]
     prior: PriorPart | None = None
     lens: LensEstimate | None = None
     datum: Similarity | None = None
@@ -80,6 +80,9 @@ def polish(
 ) -> Polished:
     """Triangulate all tracks and minimise over all registered frames.
 
+    A frame of which hardly any track is left among those that fit the cameras is held by nothing: all is done again
+    without it.
+
     Args:
         images: at least one registered; map_points: track ids and positions of the incremental map.
         focal: (g,) focal lengths, pixels; first guesses where the options refine them.
@@ -91,61 +94,54 @@ def polish(
             where the camera moves.
 
     Raises:
-        ReconstructionError: what is known of the registered frames leaves open where the world of the control is.
+        ReconstructionError: hardly any tracks are left that join frames, or what is known of the registered frames
+            leaves open where the world of the control is.
     """
-    o = options.polish
+    o, least = options.polish, options.mapper.min_inliers
     registered = [i for i, image in enumerate(images) if image.registered]
-    frames = _solved_frames(images, registered, o.max_frames)
-    if control is not None:
-        frames = sorted({*frames, *frames_under_control(registered, control, o.max_frames // 2)})
-    used = [images[i] for i in frames]
-    observations, tracks = _gather(used, min(o.min_track_length, max(2, len(used))))
     groups = np.zeros(len(images), np.int64) if groups is None else groups
-    state = _first_guess(used, observations, tracks, map_points, focal, groups[frames])
-
-    progress("polish: cameras")
-    core, few, adjustment = converge_cameras(state, observations, options)
-    lens = None
-    if options.refine_focal_length:
-        guess = Lens(focal, np.zeros(4) if shape is None else shape)
-        adjustment, lens = _estimate_lens(adjustment, guess, frames, options, first_focal)
-        few, group = adjustment.observations, adjustment.state.group
-        observations = lens.renormalize(observations, group)
+    guess = Lens(focal, np.zeros(4) if shape is None else shape)
+    left_out: dict[int, str] = {}
+    while True:
+        frames = _solved_frames(images, registered, o.max_frames)
         if control is not None:
-            zooms = len(lens.lens.focal) > len(focal)
-            whole, of_image = (
-                (_between(lens, frames, np.arange(len(images))), np.arange(len(images))) if zooms else (lens, groups)
+            frames = sorted({*frames, *frames_under_control(registered, control, o.max_frames // 2)})
+        used = [images[i] for i in frames]
+        observations, tracks = _gather(used, min(o.min_track_length, max(2, len(used))))
+        unheld = _unheld(observations, frames, least)
+        if not unheld:
+            group = groups[frames]
+            known = polish_start(
+                used, observations, tracks, map_points, guess, group, frames, options, first_focal, progress
             )
-            control = replace(control, marks=whole.renormalize(control.marks, of_image))
-        state = through(replace(state, log_focal=np.log(lens.guess.focal), group=group), lens.lens.focal)
-    motion = classify_motion(adjustment, few, o)
-    inflation = block_inflation(adjustment.reprojection_vectors(), few)
-    weighed = None
-    if motion.kind is ShotKind.GENERAL:
-        if o.depth:
-            weighed = weigh_prior(adjustment, few, tracks[core], used, inflation)
-        part = adjustment.state
-    else:
-        part = motion.rotation_only
-    free = motion.kind is ShotKind.GENERAL
+            unheld = _unheld(known.observations, frames, least)
+        if not unheld:
+            break
+        logger.info("left out of the polish, too few tracks: images %s", sorted(unheld))
+        left_out.update(unheld)
+        registered = [i for i in registered if i not in left_out]
+        if len(registered) < 2:
+            raise ReconstructionError(
+                f"{len(registered)} of {len(images)} frames have enough tracks that agree with those of other frames, "
+                "at least 2 needed"
+            )
+    observations, tracks, sigma, lens = known.observations, known.tracks, known.sigma, known.lens
+    if control is not None and lens is not None:
+        zooms = len(lens.lens.focal) > len(focal)
+        whole, of_image = (
+            (_between(lens, frames, np.arange(len(images))), np.arange(len(images))) if zooms else (lens, groups)
+        )
+        control = replace(control, marks=whole.renormalize(control.marks, of_image))
+    free, state = known.motion.kind is ShotKind.GENERAL, known.state.seen_from(0)
 
-    progress("polish: points")
-    sigma = adjustment.sigma
-    state = _with_part(state, part, core)
-    state = BundleAdjustment(state, observations, replace(o, iterations=4), sigma=sigma, points_only=True).solve()
-    if o.observation_sigmas is None:
-        observations, tracks, state = _without_outliers(state, observations, tracks, sigma, o)
-    else:
-        limit = o.observation_sigmas * sigma
-        observations, tracks, state = _without_outlying_observations(state, observations, tracks, limit, o)
     progress("polish: all tracks")
     prior = None
     # Pixel errors that repeat themselves, from frame to frame and among neighbours, weigh less; the kernel keeps its
     # width in pixels.
-    wide = float(np.sqrt(inflation))
+    wide = float(np.sqrt(known.inflation))
     final = replace(o, kernel=o.kernel / wide)
-    if weighed is not None:
-        adjustment, prior = joint_problem(state, observations, tracks, used, weighed, sigma * wide, final)
+    if known.prior is not None:
+        adjustment, prior = joint_problem(state, observations, tracks, used, known.prior, sigma * wide, final)
     else:
         adjustment = BundleAdjustment(state, observations, final, sigma=sigma * wide, free_translation=free)
     adjustment.solve(o.final_iterations)
@@ -156,13 +152,13 @@ def polish(
     observability = camera_observability(adjustment, marginals, camera_covariance)
     k = len(frames)
     if prior is not None:
-        first = 6 * k + len(state.log_focal)
+        first = 6 * k + len(adjustment.state.log_focal)
         affine = np.sqrt(camera_covariance.diagonal()[first : first + 2 * len(prior.images)])
         prior.scale_std, prior.shift_std = affine[::2], affine[1::2]
     result = Polished(
         frames, adjustment.state, tracks, observations, adjustment.reprojection_errors(), sigma,
-        motion, pose_blocks(camera_covariance, k), observability,
-        marginals.inverse_distance_std(camera_covariance), prior, lens,
+        known.motion, pose_blocks(camera_covariance, k), observability,
+        marginals.inverse_distance_std(camera_covariance), left_out, prior, lens,
     )  # fmt: skip
     result.control_unused = control is not None and not free
     if control is not None and free:
@@ -179,6 +175,16 @@ def polish(
     return result
 
 
+def _unheld(observations: Observations, frames: list[int], least: int) -> dict[int, str]:
+    """The images (of these, in the order of the observations) that too few observations join to the others, and why."""
+    joined, seen = joined_frames(observations, len(frames), least)
+    return {frames[row]: _too_few(int(seen[row]), least) for row in np.nonzero(~joined)[0].tolist()}
+
+
+def _too_few(count: int, least: int) -> str:
+    return f"{count} of {least} needed tracks agree with those of the other frames in the polish"
+
+
 def _put_under_control(result: Polished, adjustment: BundleAdjustment, control: LocatedControl) -> None:
     """Everything as it is with the control; what carries each camera stays as the images and the prior have it."""
     found = controlled(adjustment, control, result.frames)
@@ -193,113 +199,11 @@ def _put_under_control(result: Polished, adjustment: BundleAdjustment, control: 
         result.prior.scale_std, result.prior.shift_std = affine[::2], affine[1::2]
 
 
-def _estimate_lens(
-    adjustment: BundleAdjustment, guess: Lens, frames: list[int], options: Options, fallback: Array | None
-) -> tuple[BundleAdjustment, LensEstimate]:
-    """As `estimate_lens`, with a focal length for every frame where a zoom is asked for and found."""
-    zoom = None
-    if options.lens == "zoom" and len(guess.focal) == 1:
-        zoom = find_zoom(adjustment, guess, np.array(frames, np.float64), options.polish)
-    if zoom is None or not zoom.found:
-        adjustment, lens = estimate_lens(adjustment, guess, options, fallback=fallback)
-        return adjustment, replace(lens, zoom_std=zoom.std if zoom else None)
-    zoomed = Lens(np.exp(zoom.adjustment.state.log_focal), guess.shape)
-    prior = np.zeros(len(frames)), zoom.information
-    adjustment, lens = estimate_lens(zoom.adjustment, zoomed, options, prior)
-    seen = Lens(np.repeat(guess.focal, len(frames)), guess.shape)
-    return adjustment, replace(lens, guess=seen, zoom_std=zoom.std)
-
-
-# --- set-up -----------------------------------------------------------------------------------------------------
-
-
 def _gather(images: list[MappedImage], min_length: int) -> tuple[Observations, Index]:
     """Observations of all tracks that are long enough, sorted by track, and the tracks' ids."""
     ids, count = np.unique(np.concatenate([i.tracks.ids for i in images]), return_counts=True)
     ids = ids[count >= min_length]
     return gather(images, ids), ids
-
-
-def _first_guess(
-    images: list[MappedImage],
-    observations: Observations,
-    tracks: Index,
-    map_points: tuple[Index, Array],
-    focal: Array,
-    group: Index,
-) -> State:
-    """Poses in the first camera's frame, points triangulated from a few views, median inverse distance 1."""
-    first = images[0]
-    rotation, origin = first.pose
-    turn = np.array([i.rotation for i in images]) @ rotation.T
-    translation = np.array([i.translation for i in images]) - turn @ origin
-    ids, points = map_points
-    points = points @ rotation.T + origin
-    distance = np.linalg.norm(points, axis=1)
-    unit = float(np.median(1.0 / np.maximum(distance, 1e-6)))
-    translation = translation * unit
-    mapped = np.isin(tracks, ids)
-    at = np.searchsorted(ids, tracks[mapped])
-    bearing, inverse = np.empty((len(tracks), 3)), np.empty(len(tracks))
-    bearing[mapped] = points[at] / distance[at, None]
-    inverse[mapped] = 1.0 / np.maximum(distance[at] * unit, 1e-3)
-    if not mapped.all():
-        views = np.unique(np.linspace(0, len(images) - 1, _TRIANGULATION_VIEWS).astype(int))
-        few = np.isin(observations.frame, views)
-        first_of_track = np.zeros(len(few), bool)
-        first_of_track[np.searchsorted(observations.point, np.arange(len(tracks)))] = True
-        keep = few | first_of_track
-        some = Observations(observations.frame[keep], observations.point[keep], observations.xy[keep])
-        new = np.nonzero(~mapped)[0]
-        result = triangulate(
-            turn,
-            translation,
-            some.of(new),
-            focal=float(np.median(focal)),
-            inlier_px=5.0,
-            sigma=FIRST_SIGMA_PX,
-            fallback=np.ones(len(new)),
-        )
-        bearing[new], inverse[new] = result.bearing, result.inverse_distance
-    inverse = np.clip(inverse, 0.02, 20.0)
-    return State(turn, translation, bearing, inverse, np.log(focal), group=group)
-
-
-# --- stages -----------------------------------------------------------------------------------------------------
-
-
-def _with_part(state: State, part: State, core: Index) -> State:
-    """The cameras and core points of `part`, the other points of `state`."""
-    bearing, inverse = state.bearing.copy(), state.inverse_distance.copy()
-    bearing[core], inverse[core] = part.bearing, part.inverse_distance
-    return replace(part, bearing=bearing, inverse_distance=inverse)
-
-
-def _without_outliers(
-    state: State, observations: Observations, tracks: Index, sigma: float, options: PolishOptions
-) -> tuple[Observations, Index, State]:
-    """Drop tracks whose typical error is far outside that of all tracks (log scale, robust)."""
-    errors = BundleAdjustment(state, observations, options, sigma=sigma).reprojection_errors()
-    start = np.searchsorted(observations.point, np.arange(len(tracks)))
-    count = np.diff(np.append(start, len(errors)))
-    typical = np.log(np.sqrt(np.add.reduceat(errors**2, start) / count) + 1e-6)
-    center = np.median(typical)
-    spread = 1.4826 * np.median(np.abs(typical - center))
-    keep = np.nonzero(typical < center + options.outlier_sigmas * max(spread, 0.1))[0]
-    state = replace(state, bearing=state.bearing[keep], inverse_distance=state.inverse_distance[keep])
-    return observations.of(keep), tracks[keep], state
-
-
-def _without_outlying_observations(
-    state: State, observations: Observations, tracks: Index, limit_px: float, options: PolishOptions
-) -> tuple[Observations, Index, State]:
-    """Drop wrong matches one by one, and tracks of which less than two observations remain."""
-    good = BundleAdjustment(state, observations, options, sigma=1.0).reprojection_errors() < limit_px
-    good &= np.bincount(observations.point, good, len(tracks))[observations.point] >= 2
-    keep = np.unique(observations.point[good])
-    state = replace(state, bearing=state.bearing[keep], inverse_distance=state.inverse_distance[keep])
-    o = observations
-    return Observations(o.frame[good], o.point[good], o.xy[good]).of(keep), tracks[keep], state
 
 
 # --- long shots -------------------------------------------------------------------------------------------------
@@ -345,6 +249,7 @@ def _add_frames_between(
             continue
         mine = by_frame[f]
         if len(mine) < m.min_inliers:
+            result.left_out[f] = _too_few(len(mine), m.min_inliers)
             continue
         near = int(solved[np.argmin(np.abs(solved - f))])
         found = register_image(
@@ -353,6 +258,10 @@ def _add_frames_between(
         )  # fmt: skip
         if found.inliers.sum() >= m.min_inliers:
             poses[f] = found.rotation, found.translation
+        else:
+            result.left_out[f] = (
+                f"{found.inliers.sum()} of {m.min_inliers} needed inliers among {len(mine)} tracks of the polish"
+            )
     frames = sorted(poses)
     row = {f: k for k, f in enumerate(frames)}
     nearest = np.argmin(np.abs(np.array(frames)[:, None] - solved), axis=1)

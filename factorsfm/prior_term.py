@@ -115,18 +115,21 @@ def joint_problem(
     fixed: NDArray[np.bool_] | None = None,
 ) -> tuple[BundleAdjustment, PriorPart]:
     """Tracks and the prior at its weight; `fixed` as in `BundleAdjustment`."""
-    values = _prior_values(images, observations, tracks)
+    values = _prior_values(images, observations, tracks, weighed.rows)
     assert values is not None
+    first_scale, first_shift = (
+        affine[np.searchsorted(weighed.rows, values.rows)] for affine in (weighed.scale, weighed.shift)
+    )
     point = observations.point[values.at]
     nodes, node_weights, information, rest = field_grid(direction_angles(state.bearing), weighed.weight)
     count = np.bincount(point, minlength=len(tracks))[point]
     prior = PriorObservations(
         values.image, observations.frame[values.at], point, values.inverse_depth,
-        rest[point] * weighed.scale[values.image] * np.sqrt(count),
+        rest[point] * first_scale[values.image] * np.sqrt(count),
         nodes[point], node_weights[point], information, SCALE_SIGMA,
         SHIFT_SIGMA if values.free_shift else KNOWN_SHIFT_SIGMA,
     )  # fmt: skip
-    state = replace(state, scale=weighed.scale, shift=weighed.shift, field=np.zeros(len(information)))
+    state = replace(state, scale=first_scale, shift=first_shift, field=np.zeros(len(information)))
     joint = BundleAdjustment(state, observations, options, sigma=sigma, fixed=fixed, prior=prior)
     none = np.zeros(0)
     return joint, PriorPart(weighed.weight, values.rows, prior, none, none, none)
@@ -143,15 +146,17 @@ class _PriorValues:
     free_shift: bool
 
 
-def _prior_values(images: list[MappedImage], observations: Observations, tracks: Index) -> _PriorValues | None:
-    """Values of the prior at the observations, sorted as these; None where no frame carries any."""
+def _prior_values(
+    images: list[MappedImage], observations: Observations, tracks: Index, among: Index | None = None
+) -> _PriorValues | None:
+    """Values of the prior at the observations, sorted as these; None where no frame (among some) carries any."""
     rows: list[int] = []
     image, at, value = [], [], []
     order = np.lexsort((observations.point, observations.frame))
     start = np.searchsorted(observations.frame[order], np.arange(len(images) + 1))
     for row, mapped in enumerate(images):
         depth = mapped.tracks.depth
-        if depth is None:
+        if depth is None or (among is not None and row not in among):
             continue
         here = order[start[row] : start[row + 1]]
         own = np.searchsorted(mapped.tracks.ids, tracks[observations.point[here]])

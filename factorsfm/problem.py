@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,6 +63,7 @@ class State:
 
     Attributes:
         rotation (k, 3, 3), translation (k, 3): `cam_from_world`.
+        world: the frame whose camera is the world.
         bearing (n, 3) unit, inverse_distance (n,): points seen from the world's origin.
         log_focal: (g,) logarithms of the focal lengths in pixels.
         lens: (4,) distortion and principal point as in `factors.distort`, where they are estimated.
@@ -83,6 +84,7 @@ class State:
     shift: Array = field(default_factory=lambda: np.zeros(0))
     control: Array = field(default_factory=lambda: np.zeros(0))
     field: Array = field(default_factory=lambda: np.zeros(0))
+    world: int = 0
 
     def __post_init__(self) -> None:
         if not len(self.group):
@@ -97,6 +99,23 @@ class State:
     def points(self) -> Array:
         """(n, 3) Euclidean points; those at infinity end up very far away."""
         return self.bearing / np.maximum(self.inverse_distance, 1e-9)[:, None]
+
+    def seen_from(self, frame: int) -> State:
+        """The same with another camera as the world."""
+        if frame == self.world:
+            return self
+        turn, shift = self.rotation[frame], self.translation[frame]
+        rotation = self.rotation @ turn.T
+        bearing = self.bearing @ turn.T + self.inverse_distance[:, None] * shift
+        length = np.linalg.norm(bearing, axis=1)
+        return replace(
+            self,
+            rotation=rotation,
+            translation=self.translation - rotation @ shift,
+            bearing=bearing / length[:, None],
+            inverse_distance=self.inverse_distance / length,
+            world=frame,
+        )
 
     def camera_points(self, frame: Index, point: Index) -> Array:
         """(m, 3) homogeneous camera-frame vectors `q` of `factors.camera_points`."""

@@ -158,8 +158,7 @@ class FrameResult:
         prior: fitted scale and shift of the depth prior, None where the frame carries none.
         covariance: (6, 6) of (rotation vector, translation), a perturbation of `world_from_cam` on the right, relative
             to the first registered camera in the scene's unit of length, which is the mean inverse distance of the
-            points; with control absolute, in the control's world and unit; None where not registered, or where no
-            point of the result is seen.
+            points; with control absolute, in the control's world and unit; None where not registered.
         observability: what carries the pose, None where not registered.
         thumbnail: a small JPEG of the image, None where none is kept.
         camera: the lens of this frame where the frames do not share one, else None; see `Reconstruction.camera_of`.

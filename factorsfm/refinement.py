@@ -47,8 +47,8 @@ class BundleAdjustment:
         lens_sigmas: (4,) standard deviations with which `State.lens` is known beforehand (0: exactly); None: it is
             zero, the observations are undistorted.
         points_only: True holds everything but the points fixed.
-        fixed: (k,) frames whose poses are held; by default the first, which is the world. Those without observations
-            are held as well.
+        fixed: (k,) frames whose poses are held; by default the one that is the world. Those without observations are
+            held as well.
         prior: depth-prior values, or None.
         control: what is known beforehand of poses and points, or None.
     """
@@ -93,7 +93,7 @@ class BundleAdjustment:
         self._control = self._field + nodes
         self._columns = self._control + len(state.control)
         free = np.ones(self._columns, bool)
-        held = np.arange(frames) == 0 if fixed is None else fixed
+        held = np.arange(frames) == state.world if fixed is None else fixed
         self.held = held | (np.bincount(observations.frame, minlength=frames) == 0)  # nothing says where they are
         free[: self._lens] = np.repeat(~self.held, 6)
         free[self._lens : self._shape] = free_focal
@@ -299,9 +299,9 @@ class BundleAdjustment:
         pose = camera[: self._lens].reshape(-1, 6)
         turn = _exponential(-pose[:, :3])
         log_focal = camera[self._lens : self._shape]
-        by_lens = float(log_focal[s.group[0]])
-        # A new focal length moves the points along, so that the first camera sees them where it did: what the step
-        # says of that to first order is done in full. The other focal lengths are relative to that of the first camera.
+        by_lens = float(log_focal[s.group[s.world]])
+        # A new focal length moves the points along, so that the world's camera sees them where it did: what the step
+        # says of that to first order is done in full. The other focal lengths are relative to that of this camera.
         stretch = np.array([np.exp(-by_lens), np.exp(-by_lens), 1.0])
         tangent, side = tangent_basis(s.bearing), s.bearing * [1.0, 1.0, 0.0]
         turned = point[:, :2] + by_lens * np.einsum("ni,nij->nj", side, tangent)
@@ -321,6 +321,7 @@ class BundleAdjustment:
             control=s.control + camera[self._control :],
             field=s.field + camera[self._field : self._control],
             group=s.group,
+            world=s.world,
         )
 
     def solve(self, iterations: int | None = None, solve_cameras: CameraSolver = _newton_step) -> State:

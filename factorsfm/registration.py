@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import cv2
@@ -56,6 +56,10 @@ class ImageDepth:
     @property
     def valid(self) -> NDArray[np.bool_]:
         return np.isfinite(self.inverse_depth) & (self.reliability > 0.5) & (self.inverse_depth > 0.02)
+
+    def of(self, kept: NDArray[np.bool_]) -> ImageDepth:
+        """At some of the n keypoints."""
+        return replace(self, inverse_depth=self.inverse_depth[kept], reliability=self.reliability[kept])
 
 
 @dataclass(frozen=True, slots=True)

@@ -165,7 +165,7 @@ def _frame_results(
     threshold = _INLIER_SIGMAS * polished.sigma
     seen = np.bincount(o.frame, minlength=len(polished.frames))
     inliers = np.bincount(o.frame, polished.errors < threshold, len(polished.frames)).astype(int)
-    error = np.array([float(np.median(polished.errors[o.frame == k])) if n else np.nan for k, n in enumerate(seen)])
+    error = [float(np.median(polished.errors[o.frame == k])) for k in range(len(polished.frames))]
     results = []
     row_of = {position: row for row, position in enumerate(polished.frames)}
     prior = _prior_fits(polished, images, unit)
@@ -180,22 +180,24 @@ def _frame_results(
                 pycolmap.Rotation3d(state.rotation[row]), state.translation[row] * unit
             )
             result.inliers = int(inliers[row])
-            result.reprojection_error = float(error[row])
+            result.reprojection_error = error[row]
             result.prior = prior.get(row)
             if len(state.log_focal) > 1:
                 result.camera = with_focal(camera, float(state.focal[row]))
                 if lens is not None and lens.determined:
                     result.focal_std = float(lens.focal_std[state.group[row]])
-            if seen[row]:
-                covariance = polished.covariance[row].copy()
-                covariance[3:] *= unit
-                covariance[:, 3:] *= unit
-                result.covariance = covariance
+            covariance = polished.covariance[row].copy()
+            covariance[3:] *= unit
+            covariance[:, 3:] *= unit
+            result.covariance = covariance
             result.observability = polished.observability[row]
             result.message = f"{result.inliers} of {seen[row]} tracks within {threshold:.2f} pixels"
             if polished.motion.kind is ShotKind.STATIC:
                 result.status = FrameStatus.STATIC
                 result.message += "; the camera does not move"
+        elif position in polished.left_out:
+            result.status, result.message = FrameStatus.TOO_FEW_INLIERS, polished.left_out[position]
+            result.keyframe = False
         results.append(result)
     return results
 

@@ -13,13 +13,15 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.covisibility import common_tracks, components, longest_tracks, pyramid_score, track_lengths
 from factorsfm.images import ImageTracks, MappedImage, gather, renormalize, state_of
-from factorsfm.initialization import NoStart, Start, start_essential, start_pair
+from factorsfm.initialization import NoStart, Start
 from factorsfm.options import Options
 from factorsfm.point_map import PointMap
 from factorsfm.reconstruction import FrameStatus
 from factorsfm.refinement import BundleAdjustment
 from factorsfm.registration import register_image
+from factorsfm.set_start import SIGMA_PX, median_angle, possible_starts
 from factorsfm.triangulation import triangulate
 
 Array = NDArray[np.float64]
@@ -28,17 +30,11 @@ Index = NDArray[np.int64]
 logger = logging.getLogger(__name__)
 
 _SMALLEST_PART = 3  # images, besides those of the first part
-_MOST_COMMON_PAIRS = 300  # whose parallax is measured
-_STARTS_TRIED = 4
-_WIDE_ENOUGH_DEG = 8.0  # median angle of the rays beyond which a pair is no better for a start
-_GEOMETRIC_DEG = 2.0  # median angle below which a start from depth is preferred
 _LEAST_ANGLE_DEG = 1.5  # between the rays of a new point; less where those of the whole map are small
 _LEAST_ANGLE_SHARE = 0.3  # of the median angle of the map
 _WORKING_TRACKS = (150, 1000, 60_000)  # per image while the map grows: at least, at most, and in the whole set
 _LEAST_FITTING, _MOST_CONTRADICTED = 0.5, 0.25  # shares of an image's observations, and of the images
 _GROWTH = 0.1  # of the number of images after which the map is adjusted
-_PYRAMID = (2, 4, 8, 16, 32)  # cells across, of the score by which the next image is chosen
-_SIGMA_PX = 0.5  # of keypoints, until it is measured
 _GOOD_PX = 4.0  # reprojection error of a good observation
 _FOCAL_IMAGES, _FOCAL_ANGLE_DEG = 4, 3.0  # from which a guessed focal length is refined with the map
 
@@ -94,10 +90,11 @@ class SetMapper:
         self._adjustment = replace(options.polish, iterations=10, tolerance=1e-3)
         self.images = [MappedImage(t, FrameStatus.WAITING, "waiting for the start of the map") for t in tracks]
         self.points = PointMap()
-        self._common = _common_tracks(tracks)
+        self._common = common_tracks(tracks)
         self._order: list[MappedImage] = []  # of registration; the first one is the world
         self._adjusted = 0
         self._tried: dict[int, int] = {}  # by position: mapped tracks with which an image was tried last
+        self._scores: dict[int, tuple[int, int]] = {}  # by position: mapped tracks, and their score
         self._released: set[int] = set()  # positions of images that were taken out of the map again, once each
         self._held: set[int] = set()  # positions of the images whose poses are given
         self._angle = 0.0  # median angle between the rays of the latest points, degrees
@@ -121,9 +118,17 @@ class SetMapper:
         usable = self._usable()
         best: list[MappedImage] = []
         best_points = self.points
-        for start in self._starts(usable):
+        tracks = [self.images[k].tracks for k in usable]
+        starts = possible_starts(tracks, self._common[np.ix_(usable, usable)], self.options, self.focal)
+        if isinstance(starts, NoStart):
+            for k in usable:
+                self.images[k].message = starts.reason
+            return
+        least, most, total = _WORKING_TRACKS
+        working = longest_tracks(tracks, int(np.clip(total // len(tracks), least, most)))
+        for start in starts:
             self._begin(start)
-            self._grow(_longest_tracks([i.tracks for i in self.images]))
+            self._grow(working)
             if len(self._order) > len(best):
                 best, best_points = [replace(image) for image in self._order], self.points
             if len(best) > len(usable) // 2:
@@ -134,6 +139,7 @@ class SetMapper:
         self.points = best_points
         if self._order:
             self._grow(None)
+            self._say_what_is_missing()
 
     def extend(self, known: dict[int, tuple[Array, Array]]) -> None:
         """Register all images that can be on those whose poses are known, which stay as they are.
@@ -146,6 +152,9 @@ class SetMapper:
             self._accept(self.images[position], *pose, 0)
         self._held = set(known)
         self._grow(None)
+        self._say_what_is_missing()
+
+    def _say_what_is_missing(self) -> None:
         for image in self.images:
             if image.status is FrameStatus.WAITING:
                 mapped = int(self.points.contains(image.tracks.ids).sum())
@@ -155,7 +164,7 @@ class SetMapper:
     def _usable(self) -> list[int]:
         """The images of the largest component; the others learn why they are left out."""
         o = self.options
-        component = _components(self._common >= o.min_inliers)
+        component = components(self._common >= o.min_inliers)
         size = Counter(component.tolist())
         largest = max(size, key=lambda c: size[c])
         for image, c in zip(self.images, component.tolist(), strict=True):
@@ -195,65 +204,12 @@ class SetMapper:
             self._adjust()  # images that it releases come next
             self._extend(working)
 
-    # --- start --------------------------------------------------------------------------------------------------
-
-    def _starts(self, usable: list[int]) -> list[Start]:
-        """Possible starts, the best one first: two-view geometry where parallax supports it, else the prior.
-
-        With the start "pair" of the options, the paper's, the prior always comes first.
-        """
-        o = self.options
-        tracks = [i.tracks for i in self.images]
-        found: list[tuple[float, Start]] = []
-        reason = f"{len(usable)} of 2 needed images have tracks in common"
-        for a, b in self._pairs_with_parallax(usable):
-            start = start_essential(
-                tracks[a], tracks[b], o.min_tracks, focal=self.focal, sigma=_SIGMA_PX, angle_deg=0.0
-            )
-            if isinstance(start, NoStart):
-                reason = start.reason
-                continue
-            angle = _median_angle(start)
-            logger.debug("start from images %d and %d: %d points at %.1f degrees", a, b, len(start.ids), angle)
-            found.append((len(start.ids) * min(angle, _WIDE_ENOUGH_DEG), start))
-        starts = [start for _, start in sorted(found, key=lambda f: -f[0])]
-        if o.initialization == "pair" or not starts or _median_angle(starts[0]) < _GEOMETRIC_DEG:
-            lifted = self._start_from_depth(usable)
-            if isinstance(lifted, Start):
-                starts.insert(0, lifted)
-        for k in usable:
-            self.images[k].message = reason
-        return starts
-
-    def _pairs_with_parallax(self, usable: list[int]) -> list[tuple[int, int]]:
-        """Pairs with many common tracks that move against each other beyond what a rotation explains."""
-        a, b = np.triu_indices(len(usable), 1)
-        a, b = np.array(usable, int)[a], np.array(usable, int)[b]
-        most = np.argsort(-self._common[a, b], kind="stable")[:_MOST_COMMON_PAIRS]
-        scores = []
-        for i, j in zip(a[most].tolist(), b[most].tolist(), strict=True):
-            if (n := int(self._common[i, j])) >= self.options.min_tracks:
-                angle = _parallax_deg(self.images[i].tracks, self.images[j].tracks)
-                scores.append((n * min(angle, _WIDE_ENOUGH_DEG), i, j))
-        return [(i, j) for _, i, j in sorted(scores, reverse=True)[:_STARTS_TRIED]]
-
-    def _start_from_depth(self, usable: list[int]) -> Start | NoStart:
-        """The paper's: the pair with most matches."""
-        o = self.options
-        lifted = [k for k in usable if self.images[k].tracks.depth is not None]
-        if o.initialization == "essential" or not lifted:
-            return NoStart("no image has a usable depth map")
-        common = self._common[np.ix_(lifted, usable)]
-        a, b = np.unravel_index(int(np.argmax(common)), common.shape)
-        pair = [self.images[lifted[a]].tracks, self.images[usable[b]].tracks]
-        return start_pair(pair, o.min_tracks, focal=self.focal, sigma=_SIGMA_PX, inlier_px=o.inlier_px)
-
     def _begin(self, start: Start) -> None:
         for image in self._order:
             image.rotation = image.translation = None
         self.points, self._order, self._adjusted = PointMap(), [], 0
         self._released.clear()
-        self._angle = _median_angle(start)
+        self._angle = median_angle(start)
         self.points.set(start.ids, start.points)
         for position, rotation, translation in zip(start.images, start.rotation, start.translation, strict=True):
             self._accept(self.images[position], rotation, translation, len(start.ids))
@@ -266,15 +222,16 @@ class SetMapper:
         for image in self.images:
             if image.registered or image.status is FrameStatus.TOO_FEW_TRACKS:
                 continue
-            mapped = self.points.contains(image.tracks.ids)
+            position, mapped = image.tracks.position, self.points.contains(image.tracks.ids)
             n = int(mapped.sum())
-            if n < self.options.min_inliers or n < 1.2 * self._tried.get(image.tracks.position, 0):
+            if n < self.options.min_inliers or n < 1.2 * self._tried.get(position, 0):
                 continue
-            score = _pyramid_score(image.tracks.xy, mapped)
-            if score > best_score:
-                best, best_score = image, score
+            if self._scores.get(position, (0, 0))[0] != n:  # the same where the map has not grown in its sight
+                self._scores[position] = n, pyramid_score(image.tracks.xy, mapped)
+            if self._scores[position][1] > best_score:
+                best, best_score = image, self._scores[position][1]
         if best is not None:
-            self._tried[best.tracks.position] = int(self.points.contains(best.tracks.ids).sum())
+            self._tried[best.tracks.position] = self._scores[best.tracks.position][0]
         return best
 
     def _register(self, image: MappedImage) -> bool:
@@ -286,7 +243,7 @@ class SetMapper:
             tracks.xy[mapped],
             *near.pose,
             focal=self.focal,
-            sigma=_SIGMA_PX,
+            sigma=SIGMA_PX,
             inlier_px=o.inlier_px,
         )
         found = int(result.inliers.sum())
@@ -307,21 +264,24 @@ class SetMapper:
 
     def _extend(self, working: Index | None, image: MappedImage | None = None) -> None:
         """Triangulate what has no point yet: of the working tracks, of one image or of all."""
-        ids, count = np.unique(np.concatenate([i.tracks.ids for i in self._order]), return_counts=True)
-        ids = ids[count >= 2]
-        for some in (working, image.tracks.ids if image is not None else None):
-            if some is not None:
-                ids = ids[np.isin(ids, some, assume_unique=True)]
+        order = self._order
+        if image is not None:  # a map of any size costs no more than what the image has to do with
+            position = image.tracks.position
+            order = [i for i in order if i is image or self._common[position, i.tracks.position] > 0]
+        seen = track_lengths([i.tracks for i in order]) >= 2
+        ids = np.nonzero(seen)[0] if image is None else image.tracks.ids[seen[image.tracks.ids]]
+        if working is not None:
+            ids = ids[np.isin(ids, working, assume_unique=True)]
         ids = ids[~self.points.contains(ids)]
         if not len(ids):
             return
         result = triangulate(
-            np.array([i.rotation for i in self._order]),
-            np.array([i.translation for i in self._order]),
-            gather(self._order, ids),
+            np.array([i.rotation for i in order]),
+            np.array([i.translation for i in order]),
+            gather(order, ids),
             focal=self.focal,
             inlier_px=_GOOD_PX,
-            sigma=_SIGMA_PX,
+            sigma=SIGMA_PX,
             fallback=np.full(len(ids), 1e-3),
         )
         angle = np.degrees(result.angle)
@@ -334,13 +294,14 @@ class SetMapper:
     def _adjust(self) -> None:
         """Bundle adjustment of all registered images; points without two good observations are forgotten."""
         ids, points = self.points.all()
-        seen, count = np.unique(np.concatenate([i.tracks.ids for i in self._order]), return_counts=True)
-        kept = np.isin(ids, seen[count >= 2], assume_unique=True)
+        length = track_lengths([i.tracks for i in self._order])
+        kept = ids < len(length)
+        kept[kept] = length[ids[kept]] >= 2
         ids, points = ids[kept], points[kept]
         observations = gather(self._order, ids)
         state = state_of(self._order, points, self.focal)
         errors = BundleAdjustment(state, observations, self._adjustment, sigma=1.0).reprojection_errors()
-        sigma = max(float(np.median(errors)), _SIGMA_PX)
+        sigma = max(float(np.median(errors)), SIGMA_PX)
         free_focal = self._refine_focal and len(self._order) >= _FOCAL_IMAGES and self._angle > _FOCAL_ANGLE_DEG
         held = np.array([image.tracks.position in self._held for image in self._order]) if self._held else None
         adjustment = BundleAdjustment(
@@ -386,72 +347,3 @@ class SetMapper:
     def _set_focal(self, focal: float) -> None:
         renormalize(self.images, self.focal / focal)
         self.focal = focal
-
-
-def _common_tracks(tracks: list[ImageTracks]) -> NDArray[np.int64]:
-    """(n, n) number of tracks that two images have in common, 0 on the diagonal."""
-    n = len(tracks)
-    ids = np.concatenate([t.ids for t in tracks])
-    image = np.repeat(np.arange(n), [len(t.ids) for t in tracks])
-    order = np.argsort(ids, kind="stable")
-    ids, image = ids[order], image[order]
-    common = np.zeros((n, n), np.int64)
-    for step in range(1, n):
-        same = ids[step:] == ids[:-step]
-        if not same.any():
-            break
-        np.add.at(common, (image[:-step][same], image[step:][same]), 1)
-    return common + common.T
-
-
-def _components(joined: NDArray[np.bool_]) -> Index:
-    """(n,) label of the connected component of each node of an undirected graph."""
-    label = np.arange(len(joined))
-    while True:
-        lowest = np.where(joined, label[None], len(joined)).min(axis=1, initial=len(joined))
-        lower = np.minimum(label, lowest)
-        if np.array_equal(lower, label):
-            return label
-        label = lower
-
-
-def _longest_tracks(tracks: list[ImageTracks]) -> Index:
-    """Ids of the tracks on which the map grows: the longest ones of each image."""
-    least, most, total = _WORKING_TRACKS
-    count = int(np.clip(total // len(tracks), least, most))
-    length = np.bincount(np.concatenate([t.ids for t in tracks]))
-    chosen = [t.ids[np.argsort(-length[t.ids], kind="stable")[:count]] for t in tracks]
-    return np.unique(np.concatenate(chosen))
-
-
-def _median_angle(start: Start) -> float:
-    """Median angle between the rays of the points (degrees)."""
-    a, b = (start.points + r.T @ t for r, t in list(zip(start.rotation, start.translation, strict=True))[:2])
-    cosine = np.einsum("ni,ni->n", a, b) / np.linalg.norm(a, axis=1) / np.linalg.norm(b, axis=1)
-    return float(np.degrees(np.median(np.arccos(np.clip(cosine, -1.0, 1.0)))))
-
-
-def _parallax_deg(a: ImageTracks, b: ImageTracks) -> float:
-    """Median angle between the rays of common tracks after the rotation that fits them best."""
-    _, in_a, in_b = np.intersect1d(a.ids, b.ids, assume_unique=True, return_indices=True)
-    rays = [np.concatenate([t.xy[rows], np.ones((len(rows), 1))], 1) for t, rows in ((a, in_a), (b, in_b))]
-    first, second = (r / np.linalg.norm(r, axis=1, keepdims=True) for r in rays)
-    weight = np.ones(len(first))
-    angle = weight
-    for _ in range(3):  # robust: matches may be wrong
-        u, _, vt = np.linalg.svd((first * weight[:, None]).T @ second)
-        turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-        angle = np.linalg.norm(first @ turn - second, axis=1)
-        weight = 1.0 / (1.0 + (angle / max(float(np.median(angle)), 1e-9)) ** 2)
-    return float(np.degrees(np.median(angle)))
-
-
-def _pyramid_score(xy: Array, mapped: NDArray[np.bool_]) -> int:
-    """Number of mapped keypoints and their spread: occupied cells at several resolutions, fine ones counting more."""
-    low, extent = xy.min(0), np.maximum(np.ptp(xy, axis=0), 1e-9)
-    place = np.clip((xy[mapped] - low) / extent, 0.0, 1.0 - 1e-9)
-    score = 0
-    for cells in _PYRAMID:
-        cell = (place * cells).astype(np.int64)
-        score += cells * len(np.unique(cell[:, 0] * cells + cell[:, 1]))
-    return score

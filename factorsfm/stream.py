@@ -146,6 +146,9 @@ class Stream(Closing):
         self._pixels.append(pixels)
         self._thumbnails.add(frame.image)
         self._tracker.drop(mapper.outliers)
+        if len(mapper.burn_ins):
+            self._tracker.avoid(mapper.burn_ins)
+            self._forget(mapper, mapper.burn_ins)
         with self._timed("relocalization"):
             self._keep_in_sight(image, grey, pixels)
         if image.status is not FrameStatus.WAITING:  # it may still take part in the start
@@ -311,6 +314,13 @@ class Stream(Closing):
             ids, rows = self._relocalizer.find(grey, pixels)
             if mapper.relocalize(image, ids, image.tracks.xy[rows]):
                 self._tracker.revive(grey, *self._in_view(mapper, image))
+
+    def _forget(self, mapper: Mapper, ids: NDArray[np.int64]) -> None:
+        """Tracks are left out of the images before the newest, which the graph may be working on."""
+        for k, image in enumerate(mapper.images[:-1]):
+            keep = ~np.isin(image.tracks.ids, ids)
+            if not keep.all():
+                image.tracks, self._pixels[k] = image.tracks.of(keep), self._pixels[k][keep]
 
     def _expected(self, mapper: Mapper) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
         """Now and then, the ended tracks that the last image should show."""

@@ -1,4 +1,4 @@
-"""One thread for each numerical library while a reconstruction runs.
+"""One thread for each numerical library while a reconstruction runs, and the cores that a process may use.
 
 Matrices and images are small here. On cores that have other work to do, the threads of BLAS and OpenCV would spend more
 time waiting for each other than working; what runs side by side are tracking, the graph and the decoder.
@@ -6,12 +6,20 @@ time waiting for each other than working; what runs side by side are tracking, t
 
 from __future__ import annotations
 
+import os
 import threading
 
 import cv2
 from threadpoolctl import threadpool_limits
 
 from factorsfm.closing import Closing
+
+
+def available_cores() -> list[int]:
+    """Numbers of the cores that this process may use, ascending."""
+    if hasattr(os, "sched_getaffinity"):
+        return sorted(os.sched_getaffinity(0))
+    return list(range(os.cpu_count() or 1))
 
 
 class OneThreadEach(Closing):

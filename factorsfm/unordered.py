@@ -55,7 +55,7 @@ def read_images(
             try:
                 yield Frame(index, read_image(paths[index]), paths[index].name, path=paths[index])
             except InputError as error:
-                yield Unusable(index, paths[index].name, str(error).replace(str(paths[index]), paths[index].name))
+                yield Unusable(index, paths[index].name, str(error).replace(f"image {paths[index]}", "it"))
         return
     for index, image in list(enumerate(source))[frames or slice(None)]:
         try:

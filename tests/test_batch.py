@@ -20,9 +20,10 @@ from command_line import assert_error, trajectory
 from rendered import FRAMES, quick_presets, rendered
 
 from factorsfm.batch.crew import WorkerLostError, open_crew
-from factorsfm.batch.plan import Method, find_videos, plan_jobs
+from factorsfm.batch.plan import Job, Method, find_videos, plan_jobs
 from factorsfm.camera import camera_to_json
 from factorsfm.cli import main
+from factorsfm.errors import InputError
 
 Run = Callable[..., int]
 TIMEOUT = 120.0
@@ -63,6 +64,8 @@ def batch(tmp_path: Path, film: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
 
     def run(*arguments: object, source: Path = film, output: str = "out", depth: object = "none") -> int:
         given = ["--output", tmp_path / output, "--camera", tmp_path / "camera.json", "--depth", depth]
+        if "--scheduler" not in arguments:
+            given += ["--workers", "1"]  # this process; another number that follows replaces it
         return main(["batch", str(source), *map(str, given), *map(str, arguments)])
 
     return run
@@ -324,6 +327,31 @@ def test_a_pool_survives_a_killed_process(tmp_path: Path, tries: int) -> None:
     assert outcomes == {number: number * number for number in outcomes}
 
 
+@pytest.mark.parametrize(("cores", "workers"), [(1, 1), (2, 2), (5, 3), (8, 3)])
+def test_a_worker_for_every_core_but_not_more_than_shots_and_the_longest_shot_first(
+    film: Path, tmp_path: Path, batch: Run, monkeypatch: pytest.MonkeyPatch, cores: int, workers: int
+) -> None:
+    opened, done = [], []
+
+    @contextmanager
+    def crew(count: int, scheduler: str | None) -> Iterator[Any]:
+        opened.append(count)
+        with open_crew(1, scheduler) as single:
+            yield single
+
+    def shot(job: Job, *, one_thread: bool, progress: object) -> None:
+        done.append((len(job.frames), one_thread))
+        raise InputError("enough")
+
+    monkeypatch.setattr("factorsfm.batch.command.open_crew", crew)
+    monkeypatch.setattr("factorsfm.batch.command.available_cores", lambda: list(range(cores)))
+    monkeypatch.setattr("factorsfm.batch.command.reconstruct_shot", shot)
+    monkeypatch.setattr("factorsfm.batch.plan.find_shots", lambda _: [range(2), range(2, 12), range(12, 16)])
+    assert main(["batch", str(film), "--output", str(tmp_path / "out"), "--depth", "none"]) == 3
+    assert opened == [1, workers]  # one video, then three shots
+    assert done == [(10, cores < 6), (4, cores < 6), (2, cores < 6)]
+
+
 def test_one_worker_is_this_process() -> None:
     with open_crew(1, None) as crew:
         assert dict(crew.run(lambda _: os.getpid(), [1, 2])) == {1: os.getpid(), 2: os.getpid()}
@@ -335,7 +363,7 @@ def serial(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("serial")
     (folder / "camera.json").write_text(json.dumps(camera_to_json(rendered("dolly").camera)))
     write_video(folder / "film.mp4", [*rendered("dolly").images, *upside_down(rendered("truck").images), lonely()])
-    assert run_in(folder, "serial") == 0
+    assert run_in(folder, "serial", "--workers", "1") == 0
     return folder
 
 

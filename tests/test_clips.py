@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
@@ -13,8 +14,10 @@ from factorsfm import PRESETS, DepthModel, ShotKind
 from factorsfm.evaluation.alignment import pose_arrays
 from factorsfm.evaluation.metrics import TrajectoryErrors, trajectory_errors
 from factorsfm.evaluation.readers import Shot, read_shot
+from factorsfm.export.formats import export
 
 NETWORK = "tcmonodepth_tcsmallnet_192x320.onnx"
+FADE = 10  # frames
 
 
 def against_truth(result: factorsfm.Reconstruction, shot: Shot) -> TrajectoryErrors:
@@ -99,3 +102,39 @@ def reprojection_errors(model: pycolmap.Reconstruction) -> np.ndarray:
             projected = image.project_point(model.points3D[point2d.point3D_id].xyz)
             errors.append(np.linalg.norm(projected - point2d.xy))
     return np.array(errors)
+
+
+def test_a_fade_in_spoils_nothing(shared_data: Path, shared_models: Path, tmp_path: Path) -> None:
+    """The clip after ten dimmed stills: the same error, and all that is written holds what is known and no more."""
+    shot = read_shot(shared_data / "real" / "kitchen-528")
+    clip = [frame.image for frame in shot.frames()]
+    fade = [cv2.convertScaleAbs(clip[0], alpha=(k + 1) / 80) for k in range(FADE)]
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for k, image in enumerate([*fade, *clip]):
+        cv2.imwrite(str(folder / f"{k:03d}.png"), image)
+    result = factorsfm.reconstruct(folder, camera=shot.camera, depth=DepthModel(shared_models / NETWORK))
+    own, dark = result.frames[FADE:], result.frames[:FADE]
+    truth = shot.truth(np.arange(len(clip)))
+    errors = trajectory_errors(*pose_arrays([frame.cam_from_world for frame in own]), *truth)
+    assert 0.0004 < np.median(errors.ate) < 0.0014
+    assert not dark[0].registered
+    assert all(" of " in frame.message and " needed " in frame.message for frame in dark if not frame.registered)
+    seen = np.bincount(result.observation_frame, minlength=len(result.frames))
+    for k, frame in enumerate(result.frames):
+        assert (
+            frame.registered == (seen[k] >= 15) == (frame.covariance is not None) == (frame.observability is not None)
+        )
+        assert frame.covariance is None or np.isfinite(frame.covariance).all()
+    first = result.registered[0].cam_from_world
+    np.testing.assert_allclose(first.matrix(), np.eye(3, 4), atol=1e-12)
+
+    result.write(tmp_path / "result")
+    summary = json.loads((tmp_path / "result" / "summary.json").read_text())
+    assert summary["registered"] == len(result.registered)
+    for name in ("colmap", "nuke", "tum", "ply"):
+        export(result, tmp_path / f"export.{name}", format=name)
+    more = factorsfm.add_images(tmp_path / "result", [clip[5]])
+    added = more.frames[-1].cam_from_world
+    offset = (added * own[5].cam_from_world.inverse()).matrix() - np.eye(3, 4)
+    assert np.abs(offset).max() < 0.003

@@ -24,6 +24,7 @@ from factorsfm import (
     reconstruct,
 )
 from factorsfm.camera import camera_to_json, guess_camera
+from factorsfm.covisibility import common_tracks, longest_tracks, pyramid_score
 from factorsfm.evaluation.alignment import pose_arrays
 from factorsfm.evaluation.baselines import colmap_default, match_frames
 from factorsfm.evaluation.metrics import TrajectoryErrors, auc, relative_pose_errors, trajectory_errors
@@ -225,6 +226,47 @@ def test_small_parallax_is_solved_with_and_without_a_prior(with_depth: bool, cap
     assert (result.prior is not None) == with_depth
 
 
+def test_an_image_that_sees_too_little_of_the_map_is_told_so() -> None:
+    """The last one has tracks in common with its neighbour only, which see each other and nothing else."""
+    ring = Ring(6)
+    tracks = ring.tracks()
+    own = np.arange(50_000, 50_040)  # seen by two images that cannot be registered together: they are as one
+    xy = np.random.default_rng(3).uniform(-0.4, 0.4, (40, 2))
+    neighbour = tracks[5]
+    tracks[5] = ImageTracks(5, np.concatenate([neighbour.ids, own]), np.concatenate([neighbour.xy, xy]))
+    tracks.append(ImageTracks(6, own, np.random.default_rng(4).uniform(-0.4, 0.4, (40, 2))))
+    mapper = SetMapper(tracks, FOCAL, Options())
+    mapper.run()
+    assert registered(mapper) == list(range(6))
+    assert mapper.images[6].status is FrameStatus.LOST
+    assert mapper.images[6].message == "0 of 15 needed tracks have a point in the map"
+
+
+def test_tracks_in_common_are_counted_for_every_pair() -> None:
+    generator = np.random.default_rng(6)
+    ids = [np.sort(generator.choice(300, size, replace=False)) for size in (120, 80, 0, 200)]
+    tracks = [ImageTracks(k, i, np.zeros((len(i), 2))) for k, i in enumerate(ids)]
+    expected = [[len(set(a) & set(b)) if a is not b else 0 for b in ids] for a in ids]
+    np.testing.assert_array_equal(common_tracks(tracks), expected)
+
+
+def test_the_longest_tracks_of_every_image() -> None:
+    ids = [np.array([0, 1, 2, 7]), np.array([1, 2, 3]), np.array([2, 3, 5])]
+    tracks = [ImageTracks(k, i, np.zeros((len(i), 2))) for k, i in enumerate(ids)]
+    assert longest_tracks(tracks, 2).tolist() == [1, 2, 3]  # 2 is seen thrice, 1 and 3 twice
+
+
+def test_keypoints_that_are_spread_score_more() -> None:
+    generator = np.random.default_rng(7)
+    xy = np.concatenate([[[-0.5, -0.5], [0.5, 0.5]], generator.uniform(-0.5, 0.5, (500, 2))])
+    everywhere = generator.random(502) < 0.2
+    corner = (xy < 0.0).all(axis=1)
+    assert everywhere.sum() < corner.sum()
+    assert pyramid_score(xy, everywhere) > 1.1 * pyramid_score(xy, corner)
+    assert pyramid_score(xy, np.arange(502) == 5) == 2 + 4 + 8 + 16 + 32  # one cell of each resolution
+    assert pyramid_score(xy, np.zeros(502, bool)) == 0
+
+
 def test_too_little_in_common_is_no_start() -> None:
     tracks = [ImageTracks(k, 100 * k + np.arange(100), np.zeros((100, 2))) for k in range(3)]
     mapper = SetMapper(tracks, FOCAL, Options())
@@ -284,20 +326,20 @@ def test_odd_files_are_told_and_do_not_stop_the_rest(
     assert errors.r_rpe.max() < 0.1
 
     assert frames["cut.jpg"].status is frames["text.jpg"].status is FrameStatus.UNUSABLE
-    assert "truncated" in frames["cut.jpg"].message
+    assert frames["cut.jpg"].message == "it is truncated"
     assert "cannot be decoded" in frames["text.jpg"].message
     assert result.has_own_lenses
     assert result.camera_of(frames["square.png"]).width == 300
     assert result.camera_of(frames["large.png"]) is result.camera
     assert frames["flat.png"].status is FrameStatus.BLANK
     assert "0 of 30 needed keypoints" in frames["flat.png"].message
-    assert "the same image as tree.png" in frames["ztree.png"].message
+    assert frames["ztree.png"].message == "the same image as tree.png, whose pose it has"
     assert "reduced from 1200x900 to 600x450" in frames["large.png"].message
     assert "turned left" in frames["upright.png"].message
     text = "\n".join(result.notes)
     assert "2 cameras: 10 of 400x300 pixels" in text
     assert "1 of 300x300 pixels with a focal length of 322 (a guess)" in text
-    for word in ("notes.txt", "cut.jpg", "text.jpg", "large.png", "ztree.png", "flat.png"):
+    for word in ("notes.txt", "cut.jpg", "text.jpg", "large.png", "ztree.png (as tree.png)", "flat.png"):
         assert word in text
     assert result.camera.width == 400
     assert (result.observation_xy < [400, 300]).all()

@@ -10,11 +10,14 @@ from estimation_problems import make_problem, mapped_images
 from factorsfm import api
 from factorsfm.camera import PIXEL_CENTER, guess_camera, lens_shape, normalized_from_pixels, with_lens
 from factorsfm.cli import main
+from factorsfm.converge import _everywhere
 from factorsfm.errors import InputError
 from factorsfm.factors import distort
-from factorsfm.lens import Lens, renormalized, through, undistort
+from factorsfm.lens import Lens, lens_covariances, renormalized, solved_with_lens, through, undistort
+from factorsfm.noise import image_cells
 from factorsfm.options import FOCAL_STD, Options, PolishOptions
 from factorsfm.polish import polish
+from factorsfm.problem import Observations
 from factorsfm.reconstruction import ShotKind
 from factorsfm.refinement import BundleAdjustment
 
@@ -146,6 +149,52 @@ def test_the_standard_deviation_is_consistent_with_the_error():
         assert found.determined
         results.append(np.log(found.lens.focal[0] / problem.focal) / found.focal_std[0])
     assert 0.3 < np.sqrt(np.mean(np.square(results))) < 1.7
+
+
+def test_a_distortion_that_is_not_believed_makes_the_focal_length_less_certain():
+    """Too small to be told from errors of tracks, it moves the focal length by more than the tracks' noise does."""
+    off = {}
+    for lens in ("focal", "distortion"):
+        off[lens] = []
+        for seed in range(3):
+            problem = make_problem("arc", frames=6, points=150, parallax=0.3, noise_px=0.05, seed=seed)
+            found = estimated(problem, guess=1.2, shape=np.array([-0.02, 0.0, 0.0, 0.0]), lens=lens).lens
+            assert not found.lens.shape.any()
+            off[lens].append(np.log(found.lens.focal[0] / problem.focal) / found.focal_std[0])
+    conditional, joint = (np.sqrt(np.mean(np.square(off[lens]))) for lens in ("focal", "distortion"))
+    assert 0.1 < joint < 1.7
+    assert conditional > max(2.0, 1.5 * joint)
+
+
+def test_errors_as_long_as_a_track_lives_count_once():
+    """Tracks that slide away, each at a speed of its own, say less than their many observations promise."""
+    off = []
+    for seed in range(6):
+        problem = make_problem("arc", frames=24, points=120, parallax=0.3, noise_px=0.02, seed=seed)
+        o = problem.observations
+        speed = 0.3 * np.random.default_rng(seed).standard_normal((len(problem.points), 2)) / problem.focal
+        slid = o.xy + speed[o.point] * (o.frame / problem.frames)[:, None]
+        adjustment = solved_with_lens(
+            problem.truth, replace(o, xy=slid), PolishOptions(tolerance=1e-6), 0.1, np.zeros(4)
+        )  # fmt: skip
+        std = np.sqrt(max(c[0, 0] for c in lens_covariances(adjustment)))
+        off.append((adjustment.state.log_focal[0] - np.log(problem.focal)) / std)
+    assert 0.3 < np.sqrt(np.mean(np.square(off))) < 2.0
+
+
+def test_the_tracks_of_an_unknown_lens_show_all_parts_of_the_image():
+    """Long tracks in the middle, short ones at the rim: of both, the longest in their part."""
+    grid = np.stack(np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-1, 1, 6)), -1).reshape(-1, 2)
+    length = np.where(np.abs(grid).max(1) > 0.7, 4, 40)
+    place, length = np.repeat(grid, 3, axis=0), np.repeat(length, 3) + np.tile([0, 1, 2], len(grid))
+    point = np.repeat(np.arange(len(place)), length)
+    frame = np.concatenate([np.arange(n) for n in length])
+    chosen = _everywhere(Observations(frame, point, place[point]), 2)
+    cells = image_cells(place, 8, 5)
+    for cell in np.unique(cells):
+        mine = np.flatnonzero(cells == cell)
+        best = mine[np.argsort(-length[mine], kind="stable")[:2]]
+        np.testing.assert_array_equal(np.sort(length[np.intersect1d(chosen, mine)]), np.sort(length[best]))
 
 
 @pytest.mark.parametrize(("motion", "parallax"), [("truck", 0.004), ("dolly", 0.2)])

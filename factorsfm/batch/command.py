@@ -21,6 +21,7 @@ from factorsfm.options import Options
 from factorsfm.priors.depth import open_depth
 from factorsfm.priors.masks import open_masks
 from factorsfm.summary import json_text
+from factorsfm.threads import available_cores
 
 Show = Callable[[str], None]
 
@@ -30,7 +31,10 @@ logger = logging.getLogger(__name__)
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments that only this command has."""
     parser.add_argument(
-        "--workers", type=_count, metavar="N", help="processes of this machine, each with a shot (default: 1)"
+        "--workers",
+        type=_count,
+        metavar="N",
+        help="processes, each with a shot and its share of the cores (default: one for every core)",
     )
     parser.add_argument(
         "--scheduler", metavar="ADDRESS", help="of a Dask cluster whose workers see the same files, as HOST:PORT"
@@ -56,18 +60,34 @@ def run(arguments: argparse.Namespace, progress: Progress, show: Show) -> str:
     videos = find_videos(source)
     known = shots_known(output, source)
     method = _method(arguments, several=source.is_dir())
-    workers = arguments.workers or 1
-    alone = workers == 1 and not arguments.scheduler
-    with open_crew(workers, arguments.scheduler) as crew:
-        shots, unread = _find_shots(crew, videos, known, one_thread=not alone, show=show)
-        jobs = plan_jobs(shots, method, output, several=source.is_dir())
-        for job in jobs:
-            check_directory(job.folder)
-        _remove_others(output, jobs, unread)
-        index = Index(source, output, shots, unread, jobs)
-        work = partial(reconstruct_shot, one_thread=not alone, progress=progress if alone else None)
-        _reconstruct(crew, work, jobs, index, show)
+    most, scheduler = arguments.workers or len(available_cores()), arguments.scheduler
+    workers = min(most, len(videos))
+    with open_crew(workers, scheduler) as crew:
+        shots, unread = _find_shots(crew, videos, known, one_thread=_one_thread(workers, scheduler), show=show)
+    jobs = plan_jobs(shots, method, output, several=source.is_dir())
+    for job in jobs:
+        check_directory(job.folder)
+    _remove_others(output, jobs, unread)
+    index = Index(source, output, shots, unread, jobs)
+    waiting = [job for job in jobs if not job.is_done()]
+    for job in jobs:
+        if job not in waiting:
+            index.add(job)
+    index.write()
+    workers = max(1, min(most, len(waiting)))
+    with open_crew(workers, scheduler) as crew:
+        told = progress if workers == 1 and scheduler is None else None
+        work = partial(reconstruct_shot, one_thread=_one_thread(workers, scheduler), progress=told)
+        _reconstruct(crew, work, waiting, index, show)
     return _conclusion(index.entries, unread, output)
+
+
+def _one_thread(workers: int, scheduler: str | None) -> bool:
+    """Whether each worker keeps to one thread: where it has no more than a core, others would only wait for it.
+
+    How many share a machine of a cluster is not known here.
+    """
+    return scheduler is not None or len(available_cores()) < 2 * workers
 
 
 def _method(arguments: argparse.Namespace, *, several: bool) -> Method:
@@ -112,15 +132,9 @@ def _find_shots(
 
 
 def _reconstruct(crew: Crew, work: Callable[[Job], None], jobs: Sequence[Job], index: Index, show: Show) -> None:
-    waiting = []
-    for job in jobs:
-        if job.is_done():
-            index.add(job)
-        else:
-            waiting.append(job)
-    index.write()
-    line = _Line(show, jobs, waiting)
-    for job, outcome in crew.run(work, waiting):
+    """Do the jobs, the longest first, so that all workers end at about the same time."""
+    line = _Line(show, len(index.entries), jobs)
+    for job, outcome in crew.run(work, sorted(jobs, key=lambda job: -len(job.frames))):
         if isinstance(outcome, BaseException):
             logger.info("%s failed", job.folder, exc_info=outcome)
             said = str(outcome) if isinstance(outcome, FactorsfmError) else f"{type(outcome).__name__}: {outcome}"
@@ -147,8 +161,8 @@ def _remove_others(output: Path, jobs: Sequence[Job], unread: Collection[Video])
 class _Line:
     """How far it is, and how long it will take."""
 
-    def __init__(self, show: Show, jobs: Sequence[Job], waiting: Sequence[Job]) -> None:
-        self._show, self._shots, self._done = show, len(jobs), len(jobs) - len(waiting)
+    def __init__(self, show: Show, done: int, waiting: Sequence[Job]) -> None:
+        self._show, self._shots, self._done = show, done + len(waiting), done
         self._frames, self._frames_done = sum(len(job.frames) for job in waiting), 0
         self._begin = time.monotonic()
         show(f"shot {self._done} of {self._shots}")

@@ -25,7 +25,7 @@ def reconstruct_shot(job: Job, *, one_thread: bool, progress: Progress | None = 
     """Write the result of a shot, or why there is none.
 
     Args:
-        one_thread: keep to one thread, since other workers have the other cores.
+        one_thread: keep to one thread, where there is no more than a core for each worker.
 
     Raises:
         InputError: the folder cannot be written.

@@ -21,7 +21,7 @@ from factorsfm.options import TrackerOptions
 from factorsfm.tracks.local_motion import LocalMotion
 from factorsfm.tracks.patches import Array, BirthPatches, Image, in_parts
 
-_STATE = ("_texture", "_frame", "_replenished", "_next_id", "_ids", "_xy", "_velocity", "_ended")
+_STATE = ("_texture", "_frame", "_replenished", "_next_id", "_ids", "_xy", "_velocity", "_ended", "_avoided")
 BLANK_TEXTURE = 0.2  # grey levels
 _MOST_ENDED = 3000  # tracks that are remembered
 _REVIVAL_REACH = 2.0  # times that of a re-alignment: where a track should be is known less well
@@ -29,6 +29,8 @@ _SCOUTS = 64  # tracks that tell how the camera's motion has changed
 _FIT_STEPS, _FIT_RIDGE = 5, 1e-4
 _SURPRISE_PX, _SURPRISE_RATIO = 0.5, 3.0  # distance from the predicted place; and times that of the others
 _GRID = 24  # cells along the longer image side, from which new corners are taken in turn
+_LEVELS = np.arange(256)
+_EXPOSURE_CHANGE = 4.0  # mean change of the grey levels between frames, with which it is made good
 _CHECK_INTERVAL = 2  # frames: the way back of an alignment is tried in turn
 _REPLENISH_INTERVAL, _FEW = 3, 0.7  # frames between looking for corners, unless so small a share of the tracks is left
 _BLANK_SHARE = 0.2  # of the texture of the last frame; with less, a frame among others is black or a flash
@@ -72,6 +74,7 @@ class FlowTracker:
         self._xy = np.zeros((0, 2), np.float32)
         self._velocity = np.zeros((0, 2), np.float32)
         self._motion: LocalMotion | None = None  # into the present frame
+        self._avoided = np.zeros((0, 2), np.float32)  # places where no track may start
         self._patches = BirthPatches(options.window_px)
         self._window = (options.window_px, options.window_px)
         self._just_ended: list[tuple[NDArray[np.int64], BirthPatches]] = []
@@ -113,6 +116,13 @@ class FlowTracker:
         """End tracks that the mapper found to be outliers."""
         if len(ids):
             self._keep(~np.isin(self._ids, ids))
+
+    def avoid(self, ids: NDArray[np.int64]) -> None:
+        """End tracks of what is laid over the images, and start none in these places again."""
+        gone = np.isin(self._ids, ids)
+        if gone.any():
+            self._avoided = np.r_[self._avoided, self._xy[gone]]
+            self._keep(~gone)
 
     @property
     def ended(self) -> NDArray[np.int64]:
@@ -195,6 +205,7 @@ class FlowTracker:
     def _step(self, previous: _Frame, frame: _Frame, mask: NDArray[np.bool_] | None) -> None:
         """Align the patches where their tracks should be; search in the frame before for those that are not there."""
         o, old, n, grey = self.options, self._xy, len(self._ids), frame.full
+        previous = _exposed_as(previous, frame)
         start = self._predicted(previous, frame)
         checked = (self._ids + self._frame) % _CHECK_INTERVAL == 0
         new, ok = self._patches.align(
@@ -284,6 +295,8 @@ class FlowTracker:
         radius = max(2, round(0.4 * (w * h / o.max_tracks) ** 0.5))
         for x, y in (0.5 * self._xy - 0.25).round().astype(int).tolist():
             cv2.circle(free, (x, y), radius, 0, -1)
+        for x, y in (0.5 * self._avoided - 0.25).round().astype(int).tolist():
+            cv2.circle(free, (x, y), o.window_px // 2, 0, -1)
         corners = cv2.goodFeaturesToTrack(frame.half, 0, o.corner_quality, radius, mask=free, blockSize=3)
         if corners is None:
             return 0
@@ -324,6 +337,16 @@ def _halved(grey: Image) -> Image:
     return np.asarray(
         cv2.resize(grey[: h // 2 * 2, : w // 2 * 2], (w // 2, h // 2), interpolation=cv2.INTER_AREA), np.uint8
     )
+
+
+def _exposed_as(previous: _Frame, frame: _Frame) -> _Frame:
+    """The frame before with the exposure of the present one: grey levels that have the same rank."""
+    counts, target = (cv2.calcHist([f.half], [0], None, [256], [0, 256]).ravel() for f in (previous, frame))
+    levels = np.interp(np.cumsum(counts) / counts.sum(), np.cumsum(target) / target.sum(), _LEVELS)
+    if counts @ np.abs(levels - _LEVELS) < _EXPOSURE_CHANGE * counts.sum():
+        return previous
+    table = np.rint(levels).astype(np.uint8)
+    return _Frame(*(np.asarray(cv2.LUT(image, table), np.uint8) for image in previous))
 
 
 def image_texture(grey: Image) -> float:

@@ -17,6 +17,9 @@ Rows = NDArray[np.intp]
 _SUPPORT = 22  # half side of a stored patch: the window at half the birth's scale, with its margin
 _MARGIN = 1  # of a warped patch around the window: interpolation and derivative
 _STALE_PX = 0.05  # change of the map at the edge of the window with which a patch is warped again
+_EXPOSURE_CHANGE = 4.0  # grey levels, of the typical patch; without one it is up to 1.2, in fast motion more
+_WITNESSES = 64  # patches that tell of it
+_MOST_GAIN = 4.0  # of the contrast, between a patch and the image
 _STOP = cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS
 _FINE = (_STOP, 20, 0.01)
 _ALL_GOOD = 0.7  # share of the checked ones that must come back, or the others are checked, too
@@ -45,7 +48,7 @@ class BirthPatches:
 
     def add(self, grey: Image, xy: Array) -> None:
         """Store the patches around points of the current frame."""
-        patches = _cut(grey, xy)
+        patches = _cut(grey, xy, _SUPPORT)
         unit = np.tile(np.eye(2, dtype=np.float32), (len(xy), 1, 1))
         inner = slice(_SUPPORT - self._half, _SUPPORT + self._half + 1)
         self._join({"_patches": patches, "_warped": patches[:, inner, inner], "_affine": unit, "_warped_by": unit})
@@ -145,7 +148,7 @@ class BirthPatches:
         self, grey: Image, rows: Rows, start: Array, check_px: float, reach_px: float, checked: NDArray[np.bool_]
     ) -> tuple[Array, NDArray[np.bool_]]:
         self._warp(rows)
-        atlas, centers = _atlas(self._warped[self._slots[rows]], grey.shape)
+        atlas, centers = _atlas(_lit_as(self._warped[self._slots[rows]], grey, start), grey.shape)
         aligned, status, _ = cv2.calcOpticalFlowPyrLK(
             atlas, grey, centers, start.copy(), winSize=self._window, maxLevel=0, criteria=_FINE,
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
@@ -185,12 +188,33 @@ def in_parts(
     return np.concatenate(values), np.concatenate(flags)
 
 
-def _cut(grey: Image, xy: Array) -> Image:
-    """(n, side, side) patches around points at whole pixels; borders as in OpenCV's flow."""
-    side = 2 * _SUPPORT + 1
-    padded = cv2.copyMakeBorder(grey, _SUPPORT, _SUPPORT, _SUPPORT, _SUPPORT, cv2.BORDER_REFLECT_101)
-    x, y = np.rint(xy).astype(int).T
+def _cut(grey: Image, xy: Array, half: int) -> Image:
+    """(n, 2 half + 1, 2 half + 1) patches around points at the nearest pixel; borders as in OpenCV's flow."""
+    side = 2 * half + 1
+    padded = cv2.copyMakeBorder(grey, half, half, half, half, cv2.BORDER_REFLECT_101)
+    x, y = np.clip(np.rint(xy), 0, np.array(grey.shape[::-1]) - 1).astype(int).T
     return np.asarray(np.lib.stride_tricks.sliding_window_view(padded, (side, side))[y, x], np.uint8)
+
+
+def _lit_as(tiles: Image, grey: Image, xy: Array) -> Image:
+    """Tiles (n, side, side) with the mean and the contrast of the image at these places, where the exposure changed.
+
+    Nothing is done where it did not: the fit would cost a little accuracy.
+    """
+    n, side, _ = tiles.shape
+    few = slice(None, None, -(-n // _WITNESSES))
+    change = _cut(grey, xy[few], side // 2).mean(axis=(1, 2)) - tiles[few].mean(axis=(1, 2))
+    if abs(np.median(change)) < _EXPOSURE_CHANGE:
+        return tiles
+    tile, seen = (a.reshape(n, -1).astype(np.float32) for a in (tiles, _cut(grey, xy, side // 2)))
+    mean, seen_mean = (a.mean(axis=1, keepdims=True) for a in (tile, seen))
+    tile -= mean
+    seen -= seen_mean
+    contrast, seen_contrast = (np.sqrt(np.einsum("ij,ij->i", a, a))[:, None] for a in (tile, seen))
+    gain = np.clip(seen_contrast / np.maximum(contrast, 1.0), 1.0 / _MOST_GAIN, _MOST_GAIN)
+    tile *= gain
+    tile += seen_mean
+    return np.clip(np.rint(tile, out=tile), 0, 255).astype(np.uint8).reshape(tiles.shape)
 
 
 def _warped(patches: Image, affine: Array, half: int) -> Image:
