@@ -18,7 +18,7 @@ from factorsfm.refinement import BundleAdjustment
 
 _MOVED_PX = 2.0  # typical displacement of the others, from which something may be said to rest ...
 _RESTS = 0.15  # ... and the share of it by which that may seem to move: its surroundings are in its window
-_LEAST, _LEAST_SHARE = 8, 0.06  # points: fewer do no harm
+_LEAST, _LEAST_SHARE = 8, 0.08  # points: fewer do no harm
 _CONTRADICTS = 0.95  # of the cost of the others' observations, if they are explained alone
 
 

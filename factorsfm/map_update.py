@@ -35,6 +35,7 @@ _LEAST_SHARED = 30  # landmarks by which a constant keyframe takes part
 _GROSS = 4.0  # times the threshold of an inlier: a young map is wrong, too, and long tracks are precious
 _YOUNG_KEYFRAMES = 6  # up to which a map that burn-ins have bent begins again
 _YOUNG_ITERATIONS = 20  # divided by the number of keyframes
+_TRIAL_ITERATIONS = 5  # that tell whether what rests is at odds with the others
 _SOLVER = replace(PolishOptions(), tolerance=1e-3)
 _LARGEST_SIGMA_PX = 3.0
 _ALIKE = 20.0  # tracks that count as one: the errors of neighbours are alike
@@ -122,19 +123,14 @@ def update_map(copy: MapCopy, graph: FactorGraph) -> MapUpdate:
     ids = _landmarks(window, copy.points)
     if (seen := int(np.isin(newest.tracks.ids, ids).sum())) < o.min_inliers:
         return MapUpdate(position, depth, False, f"{seen} of {o.min_inliers} needed landmarks in the keyframe")
-    observations = gather(window, ids)
-    burn_ins = _burn_ins(copy, window, held, ids, observations)
-    removed = burn_ins
+    # A young map has the shape that the prior guessed, and far to go; it is also cheap.
+    iterations = max(o.graph_iterations, _YOUNG_ITERATIONS // len(copy.keyframes))
+    adjustment, guided, result = _solved(copy, graph, window, held, ids, iterations)
+    burn_ins = removed = _burn_ins(copy, window, held, ids, adjustment)
     if len(burn_ins):
         kept = _lifted_anew(copy, window, np.setdiff1d(ids, burn_ins))
         removed, ids = np.setdiff1d(ids, kept), kept
-        observations = gather(window, ids)
-    adjustment, rows = _problem(copy, window, held, ids, observations)
-    positions = [image.tracks.position for image in window]
-    guided = [positions[row] for row in rows]
-    # A young map has the shape that the prior guessed, or that burn-ins gave it, and far to go; it is also cheap.
-    iterations = max(o.graph_iterations, _YOUNG_ITERATIONS // (1 if len(burn_ins) else len(copy.keyframes)))
-    result = graph.update(adjustment, positions, guided, iterations)
+        adjustment, guided, result = _solved(copy, graph, window, held, ids, _YOUNG_ITERATIONS)
     if not result.committed:
         return MapUpdate(position, depth, False, result.reason)
     focal = _better_focal(adjustment, held) if copy.refine_focal and len(copy.keyframes) >= _LENS_KEYFRAMES else None
@@ -142,22 +138,37 @@ def update_map(copy: MapCopy, graph: FactorGraph) -> MapUpdate:
     return replace(update, removed=np.union1d(update.removed, removed), burn_ins=burn_ins) if len(burn_ins) else update
 
 
-def _burn_ins(
+def _solved(
     copy: MapCopy,
+    graph: FactorGraph,
     window: list[MappedImage],
     held: NDArray[np.bool_],
     ids: Index,
-    observations: Observations,
+    iterations: int,
+) -> tuple[BundleAdjustment, list[int], UpdateResult]:
+    """The window's problem as the graph solves it, the positions of its keyframes with a prior, and the outcome."""
+    state = state_of(window, copy.points.at(ids), copy.focal)
+    adjustment, rows = _problem(copy, window, held, ids, state, gather(window, ids))
+    positions = [image.tracks.position for image in window]
+    guided = [positions[row] for row in rows]
+    return adjustment, guided, graph.update(adjustment, positions, guided, iterations)
+
+
+def _burn_ins(
+    copy: MapCopy, window: list[MappedImage], held: NDArray[np.bool_], ids: Index, solved: BundleAdjustment
 ) -> Index:
-    """Tracks that rest in the image and contradict the others."""
-    kept = ~resting(observations, copy.focal)
-    if kept.all():
+    """Tracks that rest in the image and contradict the others, when both go on from a solution with all of them."""
+    state, observations = solved.state, solved.observations
+    rests = resting(observations, copy.focal)
+    if not rests.any():
         return np.zeros(0, np.int64)
-    together, _ = _problem(copy, window, held, ids, observations)
-    alone, _ = _problem(copy, window, held, ids[kept], observations.of(np.nonzero(kept)[0]))
+    others = np.nonzero(~rests)[0]
+    part = replace(state, bearing=state.bearing[others], inverse_distance=state.inverse_distance[others])
+    together, _ = _problem(copy, window, held, ids, state, observations)
+    alone, _ = _problem(copy, window, held, ids[others], part, observations.of(others))
     for adjustment in (together, alone):
-        adjustment.solve(_YOUNG_ITERATIONS)
-    return ids[~kept] if contradicts(together, alone, kept) else np.zeros(0, np.int64)
+        adjustment.solve(_TRIAL_ITERATIONS)
+    return ids[rests] if contradicts(together, alone, ~rests) else np.zeros(0, np.int64)
 
 
 def _lifted_anew(copy: MapCopy, window: list[MappedImage], ids: Index) -> Index:
@@ -280,10 +291,14 @@ def _add_points(
 
 
 def _problem(
-    copy: MapCopy, window: list[MappedImage], held: NDArray[np.bool_], ids: Index, observations: Observations
+    copy: MapCopy,
+    window: list[MappedImage],
+    held: NDArray[np.bool_],
+    ids: Index,
+    state: State,
+    observations: Observations,
 ) -> tuple[BundleAdjustment, list[int]]:
     """The window's problem at the noise that its residuals show, and the rows of its frames with a prior."""
-    state = state_of(window, copy.points.at(ids), copy.focal)
     unit = BundleAdjustment(state, observations, _SOLVER, sigma=1.0, fixed=held)
     typical = typical_sigma(unit.reprojection_errors())
     sigma = min(max(copy.options.pixel_sigma, typical), _LARGEST_SIGMA_PX)
