@@ -32,6 +32,12 @@ class ImageTracks:
     xy: Array
     depth: ImageDepth | None = None
 
+    def joined(self, ids: NDArray[np.int64], xy: Array) -> ImageTracks:
+        """With further tracks, of which the prior says nothing; ascending ids."""
+        order = np.argsort(np.r_[self.ids, ids])
+        depth = self.depth.padded(len(ids)).of(order) if self.depth is not None else None
+        return ImageTracks(self.position, np.r_[self.ids, ids][order], np.r_[self.xy, xy][order], depth)
+
     def of(self, kept: NDArray[np.bool_]) -> ImageTracks:
         """Some of the n tracks."""
         depth = self.depth.of(kept) if self.depth is not None else None

@@ -57,7 +57,12 @@ class ImageDepth:
     def valid(self) -> NDArray[np.bool_]:
         return np.isfinite(self.inverse_depth) & (self.reliability > 0.5) & (self.inverse_depth > 0.02)
 
-    def of(self, kept: NDArray[np.bool_]) -> ImageDepth:
+    def padded(self, count: int) -> ImageDepth:
+        """With nothing known at further keypoints."""
+        none = np.zeros(count)
+        return replace(self, inverse_depth=np.r_[self.inverse_depth, none], reliability=np.r_[self.reliability, none])
+
+    def of(self, kept: NDArray[np.bool_] | NDArray[np.intp]) -> ImageDepth:
         """At some of the n keypoints."""
         return replace(self, inverse_depth=self.inverse_depth[kept], reliability=self.reliability[kept])
 

@@ -313,7 +313,8 @@ class Stream(Closing):
         if mapper.started and not image.registered:
             ids, rows = self._relocalizer.find(grey, pixels)
             if mapper.relocalize(image, ids, image.tracks.xy[rows]):
-                self._tracker.revive(grey, *self._in_view(mapper, image))
+                revived, seen = self._tracker.revive(grey, *self._in_view(mapper, image))
+                self._add_tracks(image, revived, seen)
 
     def _forget(self, mapper: Mapper, ids: NDArray[np.int64]) -> None:
         """Tracks are left out of the images before the newest, which the graph may be working on."""
@@ -321,6 +322,12 @@ class Stream(Closing):
             keep = ~np.isin(image.tracks.ids, ids)
             if not keep.all():
                 image.tracks, self._pixels[k] = image.tracks.of(keep), self._pixels[k][keep]
+
+    def _add_tracks(self, image: MappedImage, ids: NDArray[np.int64], xy: NDArray[np.float64]) -> None:
+        """Tracks that were found in the newest image after it had been mapped."""
+        joined = image.tracks.joined(ids, normalized_from_pixels(self.camera, xy))
+        order = np.argsort(np.r_[image.tracks.ids, ids])
+        image.tracks, self._pixels[-1] = joined, np.r_[self._pixels[-1], xy][order]
 
     def _expected(self, mapper: Mapper) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
         """Now and then, the ended tracks that the last image should show."""

@@ -56,7 +56,8 @@ class Shot:
         if not guided:
             return BundleAdjustment(state, o, options, sigma=SIGMA, fixed=fixed), []
         scale, shift = np.array([self.images[k].affine or (1.0, 0.0) for k in guided]).T
-        weighed = WeighedPrior(GOOD_PRIOR, np.array(guided), scale, shift, 1.0)
+        rows = np.array([list(frames).index(k) for k in guided])
+        weighed = WeighedPrior(GOOD_PRIOR, rows, scale, shift, 1.0)
         return joint_problem(state, o, ids, window, weighed, SIGMA, options, fixed)[0], guided
 
     def solve(self, adjustment, frames, guided, *, iterations=15):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from estimation_problems import angles_between, make_problem
 
+from factorsfm.graph_process import GraphProcess
 from factorsfm.images import ImageTracks, MappedImage
 from factorsfm.mapper import Mapper
 from factorsfm.options import Options
@@ -12,7 +13,7 @@ from factorsfm.reconstruction import FrameStatus
 
 def lost_at_both_ends(problem, known, life):
     """A mapper that holds some images and the tracks of their first, each track seen for so many images."""
-    mapper = Mapper(problem.focal, 640, Options.preset_named("geometry"), has_prior=False)
+    mapper = Mapper(GraphProcess(), problem.focal, 640, Options.preset_named("geometry"), has_prior=False)
     born = np.arange(len(problem.points)) % (problem.frames + life) - life + 1
     for k in range(problem.frames):
         ids, xy = problem.of_frame(k)

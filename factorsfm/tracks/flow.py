@@ -130,8 +130,10 @@ class FlowTracker:
         self._gather_ended()
         return self._ended
 
-    def revive(self, image: NDArray[np.uint8], ids: NDArray[np.int64], xy: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Take up ended tracks in the image just tracked, where their patch is found; the ids of those.
+    def revive(
+        self, image: NDArray[np.uint8], ids: NDArray[np.int64], xy: NDArray[np.float64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Take up ended tracks in the image just tracked, where their patch is found; those, and where (pixels).
 
         Args:
             image: (h, w) grey, the last one tracked.
@@ -139,7 +141,7 @@ class FlowTracker:
         """
         inside = np.isfinite(xy).all(axis=1) & _inside(np.nan_to_num(xy), image.shape, self.options.border_px)
         if not inside.any():
-            return np.zeros(0, np.int64)
+            return np.zeros(0, np.int64), np.zeros((0, 2))
         order = np.argsort(self._ended)
         rows = order[np.searchsorted(self._ended, ids[inside], sorter=order)]
         o = self.options
@@ -163,7 +165,7 @@ class FlowTracker:
         rest[rows] = False
         self._ended = self._ended[rest]
         self._ended_patches.keep(rest)
-        return np.asarray(revived)
+        return np.asarray(revived), found.astype(np.float64)
 
     def _end(self, rows: NDArray[np.intp]) -> None:
         """Put tracks aside."""
