@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.factors import camera_points, cross_matrices
+from factorsfm.factors import camera_points
+from factorsfm.given_covariance import given_covariance
 from factorsfm.graph_process import GraphProcess
 from factorsfm.images import ImageTracks, MappedImage, median_flow, renormalize, shared_tracks
 from factorsfm.initialization import NoStart, Start
@@ -33,8 +34,6 @@ _STATE = (
     "focal", "first_focal", "keyframes", "new_points", "parallax", "started", "_waits_for_depth", "_due",
 )  # fmt: skip
 _DEPTH_PATIENCE = 3  # keyframes without a depth map after which one does without
-_YOUNG_ERROR = 0.8  # relative, of a map that only the prior has shaped; falls with the square of the keyframes
-_SAME_PLACE = 0.02  # of the camera's displacement: keyframes nearer than that tell no more of the map's shape than one
 _LEAST_RELOCALIZED = 0.7  # of the similar corners must agree with the pose; in a whole view nine tenths do
 _NOT_JOINED = (FrameStatus.LOST, FrameStatus.TOO_FEW_INLIERS)
 _PATIENCE, _YOUNG_KEYFRAMES = 5, 2  # images that do not join a map, and its keyframes, with which it is given up
@@ -356,37 +355,12 @@ class Mapper:
         image.message = f"{image.inliers} inliers within {result.threshold:.1f} pixels"
         if result.affine is not None:
             image.affine = result.affine
-        image.covariance = self._covariance(image, result.covariance)
+        solved = [self.images[k] for k in self.keyframes if self.images[k].covariance is not None]
+        image.covariance = given_covariance(image.pose, result.covariance, solved)
         inverse = self.points.inverse_depths(image, result.inliers)
         if len(inverse):  # the first camera is the world
             moved = float(np.linalg.norm(result.translation))
             self.parallax = max(self.parallax, moved * float(np.median(inverse)))
-
-    def _covariance(self, image: MappedImage, on_map: Array) -> Array:
-        """Of a pose just registered: what is uncertain on an exact map, and what the map itself leaves open."""
-        rotation, translation = image.pose
-        solved = [k for k in self.keyframes if self.images[k].covariance is not None]
-        # What linearised covariances do not know of a young map: that its whole shape is still a guess.
-        bent = _YOUNG_ERROR * float(np.linalg.norm(translation)) / self._places(solved, -rotation.T @ translation) ** 2
-        on_map = on_map + bent**2 * np.eye(6)
-        if len(solved) < 2:
-            return on_map
-        keyframe = self.images[solved[-1]]
-        assert keyframe.covariance is not None
-        turn = rotation @ keyframe.pose[0].T
-        shift = translation - turn @ keyframe.pose[1]
-        adjoint = np.zeros((6, 6))
-        adjoint[:3, :3] = adjoint[3:, 3:] = turn
-        adjoint[3:, :3] = cross_matrices(shift[None])[0] @ turn
-        return on_map + adjoint @ keyframe.covariance @ adjoint.T
-
-    def _places(self, keyframes: list[int], center: Array) -> int:
-        """From how many places keyframes have seen the scene, on the scale of the move to `center`; at least 1."""
-        centers = np.array(
-            [-rotation.T @ translation for rotation, translation in (self.images[k].pose for k in keyframes)]
-        )
-        steps = np.linalg.norm(np.diff(centers, axis=0), axis=1) if len(centers) > 1 else np.zeros(0)
-        return 1 + int((steps > _SAME_PLACE * np.linalg.norm(center)).sum())
 
     # --- keyframes and landmarks --------------------------------------------------------------------------------
 
