@@ -9,8 +9,7 @@ import re
 import threading
 import time
 from collections.abc import Collection, Iterable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -18,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.errors import InputError
+from factorsfm.video import decode, has_timestamps, quiet_opencv
 
 logger = logging.getLogger(__name__)
 
@@ -95,7 +95,9 @@ def read_frames(
                 raise InputError(f"folder {path} holds no images ({suffixes})")
             found = _folder_frames(images, selection)
         elif path.is_file():
-            found = _video_frames(path, selection, has_timestamps=_probe_video(path))
+            if path.suffix.lower() in IMAGE_SUFFIXES:
+                raise InputError(f"{path} is a single image; a video file or a folder of images is expected")
+            found = _video_frames(path, selection, timed=has_timestamps(path))
         else:
             raise InputError(f"{path} does not exist; a video file or a folder of images is expected")
         return uniform(found, str(path), selection.start)
@@ -310,66 +312,6 @@ def _jpeg_is_truncated(data: bytes) -> bool:
     return True
 
 
-def _probe_video(path: Path) -> bool:
-    """Whether the container has timestamps (without them every frame is said to be at 0)."""
-    if path.suffix.lower() in IMAGE_SUFFIXES:
-        raise InputError(f"{path} is a single image; a video file or a folder of images is expected")
-    with _open_video(path) as video:
-        if not video.grab():
-            raise InputError(f"{path} cannot be decoded as a video; it is damaged or not a video")
-        return bool(video.grab() and video.get(cv2.CAP_PROP_POS_MSEC) > 0)
-
-
-def _video_frames(path: Path, selection: slice, has_timestamps: bool) -> Iterator[Frame]:
-    # Neither the frame count nor seeking can be trusted in general: decode in order from the start.
-    last = selection.stop - 1 if selection.stop is not None else None
-    with _open_video(path) as video:
-        for index in itertools.count():
-            if (last is not None and index > last) or not video.grab():
-                return
-            if index < selection.start or (index - selection.start) % selection.step:
-                continue
-            timestamp = video.get(cv2.CAP_PROP_POS_MSEC) / 1000 if has_timestamps else None
-            decoded, image = video.retrieve()
-            if not decoded:
-                raise InputError(f"frame {index} of {path} cannot be decoded")
-            yield Frame(index, bgr_image(image, index), f"{index:06d}", timestamp)
-
-
-@contextmanager
-def _open_video(path: Path) -> Iterator[cv2.VideoCapture]:
-    with quiet_opencv():
-        video = cv2.VideoCapture(str(path))
-    try:
-        yield video
-    finally:
-        video.release()
-
-
-@dataclass(slots=True)
-class _Silence:
-    """The log level of OpenCV belongs to the process: the first thread in saves it, the last one out restores it."""
-
-    lock: threading.Lock = field(default_factory=threading.Lock)
-    wanted: int = 0
-    level: int = 0
-
-
-_silence = _Silence()
-
-
-@contextmanager
-def quiet_opencv() -> Iterator[None]:
-    """Keep OpenCV from writing to stderr what is reported as an InputError."""
-    with _silence.lock:
-        if _silence.wanted == 0:
-            _silence.level = cv2.utils.logging.getLogLevel()
-            cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-        _silence.wanted += 1
-    try:
-        yield
-    finally:
-        with _silence.lock:
-            _silence.wanted -= 1
-            if _silence.wanted == 0:
-                cv2.utils.logging.setLogLevel(_silence.level)
+def _video_frames(path: Path, selection: slice, *, timed: bool) -> Iterator[Frame]:
+    for index, image, timestamp in decode(path, selection, timed=timed):
+        yield Frame(index, bgr_image(image, index), f"{index:06d}", timestamp)

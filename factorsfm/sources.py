@@ -28,11 +28,11 @@ from factorsfm.frames import (
     Frame,
     bgr_image,
     checked_range,
-    quiet_opencv,
     read_frames,
     uniform,
     watch_folder,
 )
+from factorsfm.video import quiet_opencv
 
 logger = logging.getLogger(__name__)
 

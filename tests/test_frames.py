@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from factorsfm.errors import InputError
-from factorsfm.frames import Frame, parse_range, quiet_opencv, read_frames
+from factorsfm.frames import Frame, parse_range, read_frames
+from factorsfm.video import quiet_opencv
 
 RNG = np.random.default_rng(0)
 
@@ -47,6 +48,48 @@ def test_range_of_a_video_keeps_indices_and_content(video, text, indices):
     for frame in frames:
         assert frame.image.mean() == pytest.approx(20 * frame.index, abs=8)
         assert frame.timestamp == pytest.approx(frame.index / 25, abs=1e-6)
+
+
+@pytest.fixture(scope="module")
+def long_video(tmp_path_factory) -> Path:
+    """250 frames with their number in two brightnesses, the lower four bits on the left."""
+    path = tmp_path_factory.mktemp("video") / "film.mp4"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 25, (64, 48))
+    for index in range(250):
+        writer.write(np.hstack([image(16 * (index % 16), 32), image(16 * (index // 16), 32)]))
+    writer.release()
+    return path
+
+
+def numbers(frames) -> list[int]:
+    """The numbers that `long_video` has written into the images."""
+    sides = [(frame.image[:, 4:28].mean(), frame.image[:, 36:60].mean()) for frame in frames]
+    return [round(left / 16) + 16 * round(right / 16) for left, right in sides]
+
+
+@pytest.mark.parametrize("sought", [True, False])
+def test_a_late_range_of_a_long_video_is_exact_though_most_of_it_is_not_decoded(long_video, monkeypatch, sought):
+    decoded = []
+
+    class Counting:
+        def __init__(self, *arguments):
+            self._video = cv2_capture(*arguments)
+
+        def __getattr__(self, name):
+            return getattr(self._video, name)
+
+        def grab(self):
+            decoded.append(self._video.get(cv2.CAP_PROP_FORMAT) != -1)
+            return self._video.grab()
+
+    cv2_capture = cv2.VideoCapture
+    monkeypatch.setattr(cv2, "VideoCapture", Counting)
+    if not sought:  # two frames at one time: their packets do not tell them apart
+        monkeypatch.setattr("factorsfm.video._times", lambda *file: np.zeros(0))
+    frames = list(read_frames(long_video, slice(200, 230, 10)))
+    assert [frame.index for frame in frames] == numbers(frames) == [200, 210, 220]
+    assert [frame.timestamp for frame in frames] == pytest.approx([8.0, 8.4, 8.8], abs=1e-6)
+    assert sum(decoded) < 60 if sought else sum(decoded) >= 221
 
 
 def test_parse_range():
