@@ -25,15 +25,23 @@ def resident_mb() -> float:
 
 
 def _children() -> list[Path]:
-    lists = (task.joinpath("children").read_text() for task in Path("/proc/self/task").iterdir())
+    lists = (_read(task / "children") for task in Path("/proc/self/task").iterdir())
     return [Path("/proc", child) for children in lists for child in children.split()]
 
 
 def _ticks(process: Path) -> int:
-    fields = (process / "stat").read_text().rpartition(")")[2].split()
-    return int(fields[11]) + int(fields[12])  # utime, stime
+    fields = _read(process / "stat").rpartition(")")[2].split()
+    return int(fields[11]) + int(fields[12]) if fields else 0  # utime, stime
 
 
 def _status_mb(name: str) -> float:
-    lines = [line for process in (Path("/proc/self"), *_children()) for line in (process / "status").open()]
+    lines = "\n".join(_read(process / "status") for process in (Path("/proc/self"), *_children())).splitlines()
     return sum(int(line.split()[1]) for line in lines if line.startswith(name)) / 1024.0
+
+
+def _read(path: Path) -> str:
+    """Nothing where the thread or process has ended meanwhile."""
+    try:
+        return path.read_text()
+    except (FileNotFoundError, ProcessLookupError):
+        return ""
