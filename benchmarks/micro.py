@@ -146,7 +146,7 @@ def incremental_updates() -> str:
     header = ["landmarks", "update", *(f"keyframe {mark}" for mark in marks)]
     return (
         "Milliseconds per update, every landmark seen by every keyframe, depth prior on each, a copy to roll back to "
-        "included. `update_map` condenses the landmarks in numpy, takes 40 steps over the number of keyframes, at "
+        "included. `update_map` condenses the landmarks in numpy, takes more steps while there are few keyframes, at "
         f"least {steps}, and holds all but the newest 20 keyframes; the other has the landmarks as variables and takes "
         f"{steps} steps over all keyframes.\n\n"
         f"{table(header, rows)}"
