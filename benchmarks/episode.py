@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import resource
 import shlex
 import subprocess
 import sys
@@ -24,6 +23,7 @@ from benchmarks.inputs import NETWORK_FILES, open_shot
 from benchmarks.markdown import table
 from benchmarks.plan import FULL
 from benchmarks.run import HERE, machine
+from benchmarks.usage import cpu_seconds
 from factorsfm import InputError, find_shots, read_result, reconstruct
 from factorsfm.evaluation.alignment import pose_arrays
 from factorsfm.evaluation.metrics import trajectory_errors
@@ -125,15 +125,9 @@ def run_batch(folder: Path, output: str, network: Path, workers: int, cores: Seq
     command += ["--depth", str(network), "--workers", str(workers)]
     if any((folder / "masks").iterdir()):
         command += ["--masks", str(folder / "masks")]
-    begin, before = time.perf_counter(), _computing()
+    begin, before = time.perf_counter(), cpu_seconds()
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL, preexec_fn=partial(os.sched_setaffinity, 0, cores))
-    return Batch(workers, len(cores), time.perf_counter() - begin, _computing() - before)
-
-
-def _computing() -> float:
-    """Seconds that all cores have spent on processes started from here that have ended."""
-    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return usage.ru_utime + usage.ru_stime
+    return Batch(workers, len(cores), time.perf_counter() - begin, cpu_seconds() - before)
 
 
 def median_ate(reconstruction: Reconstruction, shot: Shot, frames: range) -> float:

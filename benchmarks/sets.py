@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
-import resource
 import signal
 import sys
 import tempfile
@@ -30,6 +29,7 @@ from numpy.typing import NDArray
 import factorsfm
 from benchmarks.inputs import NETWORK_FILES, shot_folder
 from benchmarks.plan import KITCHEN, STUDIO, UNORDERED, WIDE_VIDEO
+from benchmarks.usage import peak_mb
 from factorsfm.evaluation.alignment import pose_arrays
 from factorsfm.evaluation.baselines import colmap_default, colmap_global, colmap_tuned, match_frames
 from factorsfm.evaluation.metrics import auc, relative_pose_errors, trajectory_errors
@@ -124,7 +124,7 @@ def _judged(outcome: dict[str, Any], turns: Array, centers: Array) -> dict[str, 
         "registered": int(np.isfinite(estimate[1]).all(axis=1).sum()),
         "ate": float(np.sqrt(np.nanmean(errors.ate**2))),
         "auc": float(auc(relative_pose_errors(*estimate, turns, centers), 1.0)),
-        "peak": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "peak": peak_mb(),
     }
 
 

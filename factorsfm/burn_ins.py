@@ -29,7 +29,7 @@ def resting(observations: Observations, focal: float) -> NDArray[np.bool_]:
         focal: pixels.
     """
     o = observations
-    start = np.searchsorted(o.point, np.arange(o.point[-1] + 1))
+    start = o.first
     first, last = o.frame[start], o.frame[np.append(start[1:], len(o.frame)) - 1]
     moved = np.linalg.norm(o.xy - o.xy[start[o.point]], axis=1)
     reach = np.maximum.reduceat(moved, start)

@@ -36,10 +36,10 @@ def converge_cameras(start: State, few: Observations, options: Options) -> tuple
     rests = resting(few, float(np.median(start.focal)))
     if rests.any():
         others = np.nonzero(~rests)[0]
-        alone = _solve_core(_points_of(start, others), few.of(others), options)
+        alone = _solve_core(start.of(others), few.of(others), options)
         if contradicts(best, alone, ~rests):
             logger.info("%d of %d points rest in the image and are left out", rests.sum(), len(rests))
-            kept, start, few, best = others, _points_of(start, others), alone.observations, alone
+            kept, start, few, best = others, start.of(others), alone.observations, alone
     if (
         best.sigma > options.polish.doubtful_px
         or block_inflation(best.reprojection_vectors(), few) > _DOUBTFUL_INFLATION
@@ -48,10 +48,6 @@ def converge_cameras(start: State, few: Observations, options: Options) -> tuple
         best = _better(best, _solve_core(_flat(start, few, options.polish), few, options))
         best = _better(best, _solve_core(_reversed(best.state), few, options))
     return kept, best
-
-
-def _points_of(state: State, points: Index) -> State:
-    return replace(state, bearing=state.bearing[points], inverse_distance=state.inverse_distance[points])
 
 
 def _better(known: BundleAdjustment, other: BundleAdjustment) -> BundleAdjustment:

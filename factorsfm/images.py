@@ -33,13 +33,12 @@ class ImageTracks:
     depth: ImageDepth | None = None
 
     def joined(self, ids: NDArray[np.int64], xy: Array) -> ImageTracks:
-        """With further tracks, of which the prior says nothing; ascending ids."""
-        order = np.argsort(np.r_[self.ids, ids])
-        depth = self.depth.padded(len(ids)).of(order) if self.depth is not None else None
-        return ImageTracks(self.position, np.r_[self.ids, ids][order], np.r_[self.xy, xy][order], depth)
+        """With further tracks behind the others, of which the prior says nothing."""
+        depth = self.depth.padded(len(ids)) if self.depth is not None else None
+        return ImageTracks(self.position, np.r_[self.ids, ids], np.r_[self.xy, xy], depth)
 
-    def of(self, kept: NDArray[np.bool_]) -> ImageTracks:
-        """Some of the n tracks."""
+    def of(self, kept: NDArray[np.bool_] | NDArray[np.intp]) -> ImageTracks:
+        """Some of the n tracks, or all in another order."""
         depth = self.depth.of(kept) if self.depth is not None else None
         return ImageTracks(self.position, self.ids[kept], self.xy[kept], depth)
 
@@ -81,6 +80,12 @@ class MappedImage:
         blank = MappedImage(self.tracks, status, message)
         for field in fields(self):
             setattr(self, field.name, getattr(blank, field.name))
+
+
+def seen_by(images: Sequence[MappedImage], least: int) -> Index:
+    """Ids (ascending) of the tracks that at least so many of the images see."""
+    ids, count = np.unique(np.concatenate([image.tracks.ids for image in images]), return_counts=True)
+    return np.asarray(ids[count >= least])
 
 
 def gather(images: Sequence[MappedImage], ids: Index) -> Observations:

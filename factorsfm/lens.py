@@ -220,11 +220,9 @@ def _some_frames(state: State, observations: Observations) -> tuple[State, Obser
     keep &= seen[observations.point]
     points = np.flatnonzero(seen)
     part = replace(
-        state,
+        state.of(points),
         rotation=state.rotation[frames],
         translation=state.translation[frames],
-        bearing=state.bearing[points],
-        inverse_distance=state.inverse_distance[points],
         group=state.group[frames],
         world=int(np.searchsorted(frames, state.world)),
     )

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from factorsfm.burn_ins import contradicts, resting
 from factorsfm.graph import FactorGraph, UpdateResult
 from factorsfm.guidance import DepthGuidance
-from factorsfm.images import MappedImage, gather, shared_tracks, state_of
+from factorsfm.images import MappedImage, gather, seen_by, shared_tracks, state_of
 from factorsfm.initialization import lift
 from factorsfm.noise import typical_sigma
 from factorsfm.options import MapperOptions, PolishOptions
@@ -163,9 +163,8 @@ def _burn_ins(
     if not rests.any():
         return np.zeros(0, np.int64)
     others = np.nonzero(~rests)[0]
-    part = replace(state, bearing=state.bearing[others], inverse_distance=state.inverse_distance[others])
     together, _ = _problem(copy, window, held, ids, state, observations)
-    alone, _ = _problem(copy, window, held, ids[others], part, observations.of(others))
+    alone, _ = _problem(copy, window, held, ids[others], state.of(others), observations.of(others))
     for adjustment in (together, alone):
         adjustment.solve(_TRIAL_ITERATIONS)
     return ids[rests] if contradicts(together, alone, ~rests) else np.zeros(0, np.int64)
@@ -233,8 +232,7 @@ def _window(keyframes: list[MappedImage]) -> tuple[list[MappedImage], NDArray[np
 
 def _landmarks(window: Sequence[MappedImage], points: PointMap) -> Index:
     """Mapped tracks that two keyframes of the window see."""
-    ids, count = np.unique(np.concatenate([image.tracks.ids for image in window]), return_counts=True)
-    ids = ids[count >= 2]
+    ids = seen_by(window, 2)
     return ids[points.contains(ids)]
 
 
@@ -261,8 +259,7 @@ def add_tracks(
         images: registered; near: one of them; ids: those of its tracks that are wanted.
         focal: pixels.
     """
-    seen, count = np.unique(np.concatenate([image.tracks.ids for image in images]), return_counts=True)
-    ids = np.intersect1d(ids, seen[count >= 2])
+    ids = np.intersect1d(ids, seen_by(images, 2))
     ids = ids[~points.contains(ids)]
     return _add_points(points, images, near, ids, DepthGuidance(options, points), focal) if len(ids) else 0
 
@@ -332,8 +329,7 @@ def _judged(
     covariances = {p: _ALIKE * c * np.outer(units, units) for p, c in result.covariance.items()}
     errors = adjustment.reprojection_errors()
     limit = _GROSS * max(copy.options.inlier_px, 5.0 * float(np.median(errors)))
-    start = np.searchsorted(o.point, np.arange(len(ids)))
-    typical = np.sqrt(np.add.reduceat(errors**2, start) / np.diff(np.append(start, len(errors))))
+    typical = np.sqrt(o.mean_by_point(errors**2))
     good = (state.inverse_distance > _FARTHEST) & (typical < limit)
     newest = (o.frame == len(window) - 1) & (errors > limit)
     return MapUpdate(

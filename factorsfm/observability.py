@@ -48,8 +48,7 @@ class Motion:
 def displacement(observations: Observations) -> float:
     """Largest median displacement of the tracks of a frame against their first observation (normalised)."""
     o = observations
-    first = np.searchsorted(o.point, np.arange(o.point[-1] + 1))
-    moved = np.linalg.norm(o.xy - o.xy[first[o.point]], axis=1)
+    moved = np.linalg.norm(o.xy - o.xy[o.first[o.point]], axis=1)
     order = np.argsort(o.frame, kind="stable")
     parts = np.split(moved[order], np.nonzero(np.diff(o.frame[order]))[0] + 1)
     return max(float(np.median(part)) for part in parts)
@@ -62,7 +61,7 @@ def classify_motion(adjustment: BundleAdjustment, observations: Observations, op
         adjustment: converged over poses and points of `observations`.
     """
     state = adjustment.state
-    start = np.searchsorted(observations.point, np.arange(len(state.bearing)))
+    start = observations.first
     rays = np.concatenate([observations.xy[start], np.ones((len(start), 1))], 1)
     rays = np.einsum("nji,nj->ni", state.rotation[observations.frame[start]], rays)
     rotation_only = BundleAdjustment(
@@ -88,9 +87,8 @@ def classify_motion(adjustment: BundleAdjustment, observations: Observations, op
 def translation_gain(rotation_only: BundleAdjustment, adjustment: BundleAdjustment) -> float:
     """Decrease of the cost by translation and depth, per observation of the median track, of the same observations."""
     difference = rotation_only.observation_costs() - adjustment.observation_costs()
-    start = np.searchsorted(adjustment.observations.point, np.arange(len(adjustment.state.bearing)))
     # Median over the tracks: what moves by itself must not move the camera.
-    return float(np.median(np.add.reduceat(difference, start) / np.diff(np.append(start, len(difference)))))
+    return float(np.median(adjustment.observations.mean_by_point(difference)))
 
 
 # --- what carries each camera -----------------------------------------------------------------------------------
@@ -149,7 +147,7 @@ def triangulation_angles(state: State, observations: Observations) -> Array:
     motion = np.einsum("kji,kj->ki", state.rotation, state.translation)
     ray = state.bearing[o.point] + state.inverse_distance[o.point, None] * motion[o.frame]
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-    start = np.searchsorted(o.point, np.arange(len(state.bearing)))
+    start = o.first
     center = np.add.reduceat(ray, start)
     basis = tangent_basis(center / np.linalg.norm(center, axis=1, keepdims=True))
     flat = np.einsum("mi,mij->mj", ray, basis[o.point])

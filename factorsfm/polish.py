@@ -13,7 +13,7 @@ from factorsfm.control import LocatedControl
 from factorsfm.controlled import controlled, frames_under_control
 from factorsfm.errors import ReconstructionError
 from factorsfm.evaluation.alignment import Similarity
-from factorsfm.images import MappedImage, gather
+from factorsfm.images import MappedImage, gather, seen_by
 from factorsfm.joined import joined_frames
 from factorsfm.lens import Lens, LensEstimate
 from factorsfm.marginals import in_scene_unit
@@ -201,8 +201,7 @@ def _put_under_control(result: Polished, adjustment: BundleAdjustment, control: 
 
 def _gather(images: list[MappedImage], min_length: int) -> tuple[Observations, Index]:
     """Observations of all tracks that are long enough, sorted by track, and the tracks' ids."""
-    ids, count = np.unique(np.concatenate([i.tracks.ids for i in images]), return_counts=True)
-    ids = ids[count >= min_length]
+    ids = seen_by(images, min_length)
     return gather(images, ids), ids
 
 

@@ -134,7 +134,7 @@ def _first_guess(
 def _triangulated(cameras: State, observations: Observations, points: Index, fallback: Array) -> Triangulation:
     """Some points from a few views each, spread over their tracks; `fallback` as in `triangulate`."""
     o = observations.of(points)
-    start = np.searchsorted(o.point, np.arange(len(points)))
+    start = o.first
     length = np.diff(np.append(start, len(o.point)))[o.point]
     place = np.arange(len(o.point)) - start[o.point]
     spaced = place * _TRIANGULATION_VIEWS // length > (place - 1) * _TRIANGULATION_VIEWS // length
@@ -197,14 +197,11 @@ def _without_outliers(
 ) -> tuple[Observations, Index, State]:
     """Drop tracks whose typical error is far outside that of all tracks (log scale, robust)."""
     errors = BundleAdjustment(state, observations, options, sigma=sigma).reprojection_errors()
-    start = np.searchsorted(observations.point, np.arange(len(tracks)))
-    count = np.diff(np.append(start, len(errors)))
-    typical = np.log(np.sqrt(np.add.reduceat(errors**2, start) / count) + 1e-6)
+    typical = np.log(np.sqrt(observations.mean_by_point(errors**2)) + 1e-6)
     center = np.median(typical)
     spread = 1.4826 * np.median(np.abs(typical - center))
     keep = np.nonzero(typical < center + options.outlier_sigmas * max(spread, 0.1))[0]
-    state = replace(state, bearing=state.bearing[keep], inverse_distance=state.inverse_distance[keep])
-    return observations.of(keep), tracks[keep], state
+    return observations.of(keep), tracks[keep], state.of(keep)
 
 
 def _without_outlying_observations(
@@ -214,6 +211,5 @@ def _without_outlying_observations(
     good = BundleAdjustment(state, observations, options, sigma=1.0).reprojection_errors() < limit_px
     good &= np.bincount(observations.point, good, len(tracks))[observations.point] >= 2
     keep = np.unique(observations.point[good])
-    state = replace(state, bearing=state.bearing[keep], inverse_distance=state.inverse_distance[keep])
     o = observations
-    return Observations(o.frame[good], o.point[good], o.xy[good]).of(keep), tracks[keep], state
+    return Observations(o.frame[good], o.point[good], o.xy[good]).of(keep), tracks[keep], state.of(keep)

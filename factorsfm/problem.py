@@ -26,6 +26,16 @@ class Observations:
     point: Index
     xy: Array
 
+    @property
+    def first(self) -> Index:
+        """(n,) row of the first observation of each point."""
+        return np.searchsorted(self.point, np.arange(self.point[-1] + 1 if len(self.point) else 0))
+
+    def mean_by_point(self, values: Array) -> Array:
+        """(n,) mean over the observations of each point of something that each has, (m,)."""
+        first = self.first
+        return np.asarray(np.add.reduceat(values, first) / np.diff(np.append(first, len(values))))
+
     def of(self, points: Index) -> Observations:
         """Those of some points (ascending), renumbered."""
         keep = np.isin(self.point, points)
@@ -99,6 +109,10 @@ class State:
     def points(self) -> Array:
         """(n, 3) Euclidean points; those at infinity end up very far away."""
         return self.bearing / np.maximum(self.inverse_distance, 1e-9)[:, None]
+
+    def of(self, points: Index) -> State:
+        """The same with some of the points, as `Observations.of` numbers them."""
+        return replace(self, bearing=self.bearing[points], inverse_distance=self.inverse_distance[points])
 
     def seen_from(self, frame: int) -> State:
         """The same with another camera as the world."""

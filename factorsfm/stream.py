@@ -326,8 +326,8 @@ class Stream(Closing):
     def _add_tracks(self, image: MappedImage, ids: NDArray[np.int64], xy: NDArray[np.float64]) -> None:
         """Tracks that were found in the newest image after it had been mapped."""
         joined = image.tracks.joined(ids, normalized_from_pixels(self.camera, xy))
-        order = np.argsort(np.r_[image.tracks.ids, ids])
-        image.tracks, self._pixels[-1] = joined, np.r_[self._pixels[-1], xy][order]
+        order = np.argsort(joined.ids)
+        image.tracks, self._pixels[-1] = joined.of(order), np.r_[self._pixels[-1], xy][order]
 
     def _expected(self, mapper: Mapper) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
         """Now and then, the ended tracks that the last image should show."""

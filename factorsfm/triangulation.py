@@ -56,8 +56,8 @@ def triangulate(
         focal, inlier_px, sigma: pixels.
     """
     o = observations
-    n = int(o.point[-1]) + 1
-    start = np.searchsorted(o.point, np.arange(n))
+    start = o.first
+    n = len(start)
     count = np.diff(np.append(start, len(o.point)))
     rays = np.concatenate([o.xy, np.ones((len(o.xy), 1))], 1)
     rays = np.einsum("nji,nj->ni", rotation[o.frame], rays)

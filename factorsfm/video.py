@@ -70,7 +70,7 @@ def _found(video: cv2.VideoCapture, path: Path, index: int) -> bool:
     """
     status = path.stat()
     times = _times(path, status.st_size, status.st_mtime_ns)
-    if index >= len(times) or not _agree(path, times):
+    if index >= len(times):
         return False
     video.set(cv2.CAP_PROP_POS_FRAMES, index)
     while video.grab():
@@ -80,23 +80,23 @@ def _found(video: cv2.VideoCapture, path: Path, index: int) -> bool:
     return False
 
 
-def _agree(path: Path, times: NDArray[np.float64]) -> bool:
-    """Whether the first frames that are decoded have these times: packets may be hidden, or cut off by an edit."""
-    with _open(path) as video:
-        first = [video.get(cv2.CAP_PROP_POS_MSEC) for _ in range(_COMPARED) if video.grab()]
-    return len(times) >= len(first) and bool((np.abs(np.array(first) - times[: len(first)]) < _SAME_MS).all())
-
-
 @lru_cache(8)
 def _times(path: Path, size: int, modified_ns: int) -> NDArray[np.float64]:
-    """Times (ms) of all packets of a file as it is now, ascending; none where two are the same."""
-    times = []
+    """Times (ms) of all frames of a file as it is now, ascending, from its packets; none where these leave a doubt.
+
+    Two at one time would, and so would packets that are hidden or cut off by an edit: then the first frames that are
+    decoded have other times.
+    """
+    packets = []
     with _open(path) as video:
         if video.set(cv2.CAP_PROP_FORMAT, -1):  # packets as they are
             while video.grab():
-                times.append(video.get(cv2.CAP_PROP_POS_MSEC))
-    ascending = np.sort(np.array(times, np.float64))
-    return ascending if (np.diff(ascending) > _SAME_MS).all() else ascending[:0]
+                packets.append(video.get(cv2.CAP_PROP_POS_MSEC))
+    with _open(path) as video:
+        first = [video.get(cv2.CAP_PROP_POS_MSEC) for _ in range(_COMPARED) if video.grab()]
+    times = np.sort(np.array(packets, np.float64))
+    agree = len(times) >= len(first) and (np.abs(np.array(first) - times[: len(first)]) < _SAME_MS).all()
+    return times if agree and (np.diff(times) > _SAME_MS).all() else times[:0]
 
 
 @contextmanager
