@@ -317,7 +317,7 @@ def _plot(records: list[dict[str, Any]]) -> None:
 def real_cases() -> list[Case]:
     """The photographs and the videos."""
     lenses = (True, False)
-    wide = [Case(n, m, known) for n in UNORDERED for known in lenses for m in ("COLMAP", "sift")]
+    wide = [Case(n, m, known) for n in UNORDERED for known in lenses for m in ("COLMAP", "COLMAP global", "sift")]
     small = [
         Case(n, m, known)
         for n in KITCHEN
