@@ -26,6 +26,9 @@ PIXEL_CENTER = 0.5  # of pycolmap's pixels; subtract it to get OpenCV's
 # lenses (18 to 50 mm on Super 35, 69 to 28 degrees), so that the guess is wrong by a factor of two at most.
 GUESSED_FIELD_OF_VIEW = math.radians(50)
 
+# Focal length over the longer side: beyond, a unit has been mistaken. A lens of 2,000 mm on Super 35 film has 80.
+_FOCAL_RATIOS = (0.05, 200.0)
+
 _RADIAL_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 _RADIAL_NAMES = ("f", "fx", "fy", "cx", "cy", "k", "k1", "k2")
 
@@ -42,7 +45,7 @@ def read_camera(path: str | Path) -> pycolmap.Camera:
     """
     path = Path(path)
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise InputError(f"camera file {path} cannot be read: {error.strerror}") from error
     except ValueError as error:
@@ -194,6 +197,12 @@ def camera_from_json(content: Mapping[str, Any]) -> pycolmap.Camera:
         raise InputError(f'"params" has {len(params)} numbers; {model} takes {camera.params_info}')
     if any(params[i] <= 0 for i in camera.focal_length_idxs()):
         raise InputError(f"the focal length in {params} is not positive")
+    low, high = (ratio * max(width, height) for ratio in _FOCAL_RATIOS)
+    for focal in (params[i] for i in camera.focal_length_idxs()):
+        if not low <= focal <= high:
+            raise InputError(
+                f"the focal length is {focal:g} pixels, of images of {width}x{height}; {low:g} to {high:g} is expected"
+            )
     camera.params = _shift_center(camera, PIXEL_CENTER)
     return camera
 

@@ -26,6 +26,8 @@ IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".
 _RANGE = re.compile(r"(\d*):(\d*)(?::(\d+))?", re.ASCII)
 _JPEG_MARKER = re.compile(rb"\xff+([^\x00\xff\xd0-\xd7])", re.DOTALL)  # neither stuffing nor a restart
 
+_PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
+
 _POLL_SECONDS = 0.1  # between two looks at a folder that is being filled
 _PATIENCE_SECONDS = 2.0  # an image that has not changed for so long and still cannot be decoded is damaged
 
@@ -293,7 +295,8 @@ def read_image(path: Path) -> NDArray[np.uint8]:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"image {path} cannot be read: {error.strerror}") from error
-    if data.startswith(b"\xff\xd8") and _jpeg_is_truncated(data):
+    # Both before decoding: libjpeg fills the rest with grey, and libpng complains on stderr, past all logging.
+    if (data.startswith(b"\xff\xd8") and _jpeg_is_truncated(data)) or (data.startswith(_PNG) and _PNG_END not in data):
         raise InputError(f"image {path} is truncated")
     with quiet_opencv():
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
@@ -303,7 +306,7 @@ def read_image(path: Path) -> NDArray[np.uint8]:
 
 
 def _jpeg_is_truncated(data: bytes) -> bool:
-    """Whether the end marker is missing: the decoder fills the rest with grey and reports success."""
+    """Whether the end marker is missing."""
     position = 2
     while marker := _JPEG_MARKER.search(data, position):
         if marker[1] == b"\xd9":

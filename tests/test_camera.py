@@ -89,6 +89,8 @@ def test_no_points_stay_no_points():
         ({key: PLAIN[key] for key in PLAIN if key != "cx"}, '"cx" is missing'),
         ({**PLAIN, "fx": -500}, "not positive"),
         ({**PLAIN, "fy": 0}, "not positive"),
+        ({**PLAIN, "fy": 1e-3}, r"focal length is 0.001 pixels, of images of \d+x\d+; \d+ to \d+ is expected"),
+        ({**PLAIN, "fx": 1e9}, "focal length is 1e\\+09 pixels"),
         ({**PLAIN, "fx": float("nan")}, '"fx" is nan; a finite number'),
         ({**PLAIN, "cy": float("inf")}, '"cy" is inf'),
         ({**PLAIN, "cy": "12"}, "\"cy\" is '12'"),
@@ -111,6 +113,11 @@ def test_bad_file_is_refused_in_one_sentence(tmp_path, content, reason):
         read_camera(path)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_byte_order_mark_is_no_part_of_the_file(tmp_path):
+    (tmp_path / "camera.json").write_text(json.dumps(PLAIN), encoding="utf-8-sig")
+    assert read_camera(tmp_path / "camera.json").width == PLAIN["width"]
 
 
 def test_missing_file_and_folder_are_refused(tmp_path):

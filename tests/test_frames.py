@@ -259,7 +259,7 @@ def test_folder_without_images_is_refused_at_the_call(tmp_path):
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp", ".bmp", ".tif"])
 @pytest.mark.parametrize("kept", [0.0, 0.3, 0.95])
-def test_truncated_image_is_named(tmp_path, suffix, kept):
+def test_truncated_image_is_named(tmp_path, suffix, kept, capfd):
     noise = RNG.integers(0, 255, (48, 64, 3), dtype=np.uint8)
     for index in range(2):
         cv2.imwrite(str(tmp_path / f"{index}{suffix}"), noise)
@@ -270,6 +270,7 @@ def test_truncated_image_is_named(tmp_path, suffix, kept):
     assert next(frames).name == f"0{suffix}"
     with pytest.raises(InputError, match=rf"1\{suffix} .*truncated"):
         next(frames)
+    assert capfd.readouterr().err == ""
 
 
 def test_jpeg_with_thumbnail_or_trailing_data_is_complete(tmp_path):

@@ -12,6 +12,7 @@ from numpy.testing import assert_allclose
 
 from factorsfm.errors import InputError
 from factorsfm.evaluation.metrics import point_depth_errors
+from factorsfm.evaluation.plain_pickle import load_plain_pickle
 from factorsfm.evaluation.readers import (
     read_7scenes,
     read_colmap,
@@ -206,7 +207,7 @@ def test_read_studiosfm(tmp_path, ids):
     assert_allclose(shot.camera.params, [10, 11, 6, 4])
 
 
-@pytest.mark.parametrize("protocol", range(2, pickle.HIGHEST_PROTOCOL + 1))
+@pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
 def test_studiosfm_pickles_of_any_age(tmp_path, protocol):
     """Also the module names of numpy 1, and matrices as lists, float32 and numpy scalars as ids."""
     records = {
@@ -216,14 +217,35 @@ def test_studiosfm_pickles_of_any_age(tmp_path, protocol):
         },
         np.int64(10): {"intr_mtx": K.astype(np.float32), "v2c": np.asfortranarray(cam_from_world())},
     }
-    if protocol == 2:  # bytes inside arrays would need a codec there; the authors' Python 3.7 writes 3
-        records = {9: {"intr_mtx": K.tolist(), "v2c": cam_from_world().tolist()}}
     folder = write_studiosfm(tmp_path, records, protocol)
     if protocol == 3:
         data = (folder / "camera.pkl").read_bytes()
         assert b"numpy._core" in data or b"numpy.core" in data
         (folder / "camera.pkl").write_bytes(data.replace(b"numpy._core.multiarray", b"numpy.core.multiarray"))
     check_pose(read_studiosfm(folder))
+
+
+def test_an_array_as_python_2_pickled_it(tmp_path):
+    (tmp_path / "a.pkl").write_bytes(
+        b"cnumpy.core.multiarray\n_reconstruct\np0\n(cnumpy\nndarray\np1\n(I0\ntp2\nS'b'\np3\ntp4\nRp5\n(I1\n(I2\ntp6\n"
+        b"cnumpy\ndtype\np7\n(S'f8'\np8\nI0\nI1\ntp9\nRp10\n(I3\nS'<'\np11\nNNNI-1\nI-1\nI0\ntp12\nbI00\n"
+        rb"S'\x00\x00\x00\x00\x00\x00\xf0?\x00\x00\x00\x00\x00\x00\x00@'"
+        b"\np13\ntp14\nb."
+    )
+    assert_allclose(load_plain_pickle(tmp_path / "a.pkl"), [1.0, 2.0])
+
+
+def test_no_codec_but_that_of_bytes_is_looked_up(tmp_path):
+    (tmp_path / "a.pkl").write_bytes(b"c_codecs\nencode\n(Vabc\nVrot13\ntR.")
+    with pytest.raises(InputError, match="encoded as 'rot13'"):
+        load_plain_pickle(tmp_path / "a.pkl")
+
+
+@pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
+def test_plain_containers_of_any_age(tmp_path, protocol):
+    content = {"a": {1, 2}, "b": frozenset([3]), "c": (b"\x00\xff", [np.float64(2.0)])}
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps(content, protocol))
+    assert load_plain_pickle(tmp_path / "a.pkl") == content
 
 
 class Evil:

@@ -9,7 +9,7 @@ from typing import Any
 
 from factorsfm.errors import InputError
 
-# Everything that a pickle of arrays, dtypes and numpy scalars names; containers and numbers need no name.
+# Everything that a pickle of arrays, dtypes, numpy scalars and plain containers names.
 _ALLOWED = {
     ("numpy", "ndarray"),
     ("numpy", "dtype"),
@@ -17,12 +17,23 @@ _ALLOWED = {
     ("numpy._core.multiarray", "scalar"),
     ("numpy._core.numeric", "_frombuffer"),
     ("collections", "OrderedDict"),
+    ("builtins", "set"),
+    ("builtins", "frozenset"),
 }
+
+
+def _latin1(text: str, encoding: str) -> bytes:
+    """Bytes as pickles of protocol 2 and older hold them; no other codec is looked up."""
+    if encoding != "latin1":
+        raise pickle.UnpicklingError(f"it holds bytes encoded as {encoding!r}")
+    return text.encode("latin1")
 
 
 class _PlainUnpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
-        module = module.replace("numpy.core.", "numpy._core.")
+        if (module, name) == ("_codecs", "encode"):
+            return _latin1
+        module = module.replace("numpy.core.", "numpy._core.").replace("__builtin__", "builtins")
         if (module, name) not in _ALLOWED:
             raise pickle.UnpicklingError(f"it names {module}.{name}, which is no plain data")
         return super().find_class(module, name)
@@ -35,7 +46,7 @@ def load_plain_pickle(path: Path) -> Any:
         InputError: the file is unreadable, or the pickle names anything else; nothing of it is executed.
     """
     try:
-        return _PlainUnpickler(io.BytesIO(path.read_bytes())).load()
+        return _PlainUnpickler(io.BytesIO(path.read_bytes()), encoding="latin1").load()  # of Python 2, too
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error}") from error
     except Exception as error:  # a damaged pickle can fail in any way
