@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 
 STUDIO = (
@@ -91,7 +91,17 @@ EXPERIMENTS: dict[str, list[Cell]] = {
 }
 
 QUICK = {
-    "pose": _cells((STUDIO[2], STUDIO[5]), ("default", *PAPER, "geometry", *COLMAP), _BOTH, (FIRST_20,)),
+    "pose": _cells((STUDIO[2], STUDIO[5]), ("default", *PAPER, "geometry", *COLMAP), _BOTH, (FIRST_10,)),
     "short": _cells((STUDIO[2], *KITCHEN[:1]), (*_THREE, "colmap_tuned"), ("tcmonodepth",), (FIRST_10,)),
     "edge": _cells(EDGE[:1], ("default",), ("tcmonodepth",)),
 }
+
+OTHERS = "others"  # experiment with the sets of the data that no other one names
+
+
+def planned(sets: Collection[str], quick: bool) -> dict[str, list[Cell]]:
+    """Experiments on the sets (names) that there are."""
+    named = {cell.shot for cells in EXPERIMENTS.values() for cell in cells}
+    others = _cells(sorted(set(sets) - named), (*_THREE, *COLMAP), ("tcmonodepth",))
+    plan = QUICK if quick else {**EXPERIMENTS, OTHERS: others}
+    return {name: [cell for cell in cells if cell.shot in sets] for name, cells in plan.items()}

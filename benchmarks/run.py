@@ -27,7 +27,7 @@ from pathlib import Path
 
 from benchmarks.cell import CODE_CHANGED, Folders, matches_folder, unregistered
 from benchmarks.inputs import open_shot
-from benchmarks.plan import COLMAP, CRF_30, EXPERIMENTS, QUICK, Cell
+from benchmarks.plan import COLMAP, CRF_30, EXPERIMENTS, NO_PRIOR, OTHERS, Cell, planned
 from benchmarks.store import load, record_path, save
 
 HERE = Path(__file__).parent
@@ -39,7 +39,10 @@ def main() -> None:
     arguments = _arguments()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that no cell outlives the run
     folders = Folders(arguments.data.resolve(), arguments.models.resolve(), arguments.cache.resolve())
-    plan = QUICK if arguments.quick else EXPERIMENTS
+    sets = {path.parent.name for path in folders.data.glob("*/*/groundtruth.txt")}
+    plan = planned(sets, arguments.quick)
+    if absent := sorted({cell.shot for cells in EXPERIMENTS.values() for cell in cells} - sets):
+        _say(f"Not in {arguments.data}, and left out: {', '.join(absent)}.")
     chosen = {
         name: [cell for cell in cells if _wanted(cell, arguments)]
         for name, cells in plan.items()
@@ -48,6 +51,8 @@ def main() -> None:
     if importlib.util.find_spec("imageio_ffmpeg") is None:
         _say(f"The variant {CRF_30} is left out: it needs the package imageio-ffmpeg.")
         chosen = {name: [cell for cell in cells if cell.variant != CRF_30] for name, cells in chosen.items()}
+    if not any(chosen.values()):
+        sys.exit(f"nothing to measure: of the {len(sets)} sets in {arguments.data} no cell is wanted")
     measure_all([cell for cells in chosen.values() for cell in cells], folders, arguments.timeout, arguments.retry)
     write_manifest(chosen, folders, arguments.output)
 
@@ -170,8 +175,10 @@ def _is_measured(path: Path, retry: bool) -> bool:
 
 
 def _wanted(cell: Cell, arguments: argparse.Namespace) -> bool:
-    return (not arguments.shots or any(fnmatch(cell.shot, f"{pattern}*") for pattern in arguments.shots)) and (
-        not arguments.methods or cell.method in arguments.methods
+    return (
+        (not arguments.shots or any(fnmatch(cell.shot, f"{pattern}*") for pattern in arguments.shots))
+        and (not arguments.methods or cell.method in arguments.methods)
+        and (not arguments.priors or cell.prior in (NO_PRIOR, *arguments.priors))
     )
 
 
@@ -186,7 +193,9 @@ def _arguments() -> argparse.Namespace:
     add("--models", type=Path, help="folder of the networks (default: models beside the data)")
     add("--shots", nargs="+", metavar="NAME", help="only these, by the beginning of the name or a pattern")
     add("--methods", nargs="+", metavar="NAME", help="only these presets and baselines")
-    add("--experiments", nargs="+", choices=EXPERIMENTS, metavar="NAME", help=", ".join(EXPERIMENTS))
+    add("--priors", nargs="+", metavar="NAME", help="of the methods that take a prior, only these, such as simulated")
+    experiments = [*EXPERIMENTS, OTHERS]
+    add("--experiments", nargs="+", choices=experiments, metavar="NAME", help=", ".join(experiments))
     add("--quick", action="store_true", help="a slice of a few minutes")
     add("--timeout", type=float, default=3600.0, help="seconds for a method on a shot (default: %(default).0f)")
     add("--retry", action="store_true", help="measure again what failed before")

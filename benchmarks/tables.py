@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks import figures
 from benchmarks.comparison import POSE, against_colmap, no_harm
 from benchmarks.markdown import table
-from benchmarks.plan import COLMAP, DEGRADED, KITCHEN, STUDIO
+from benchmarks.plan import COLMAP, DEGRADED, KITCHEN, OTHERS, STUDIO
 from benchmarks.scores import (
     Label,
     Records,
@@ -215,6 +215,7 @@ SECTIONS: Mapping[str, tuple[str, Callable[[Records, Path], list[str]]]] = {
     "useless": ("Useless priors", _pooled),
     "networks": ("Depth networks", _networks),
     "noise": ("Noise on the true depth", _pooled),
+    OTHERS: ("Other sets", _real),
 }
 
 
