@@ -8,6 +8,7 @@ import shutil
 import sys
 import time
 from collections.abc import Sequence
+from logging.handlers import MemoryHandler
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NoReturn, TextIO, get_args
@@ -37,7 +38,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = _parser().parse_args(argv)
     progress = _Progress(sys.stderr, enabled=sys.stderr.isatty() and not arguments.verbose)
     level = (logging.WARNING, logging.INFO, logging.DEBUG)[min(arguments.verbose, 2)]
-    logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s", handlers=[_LogHandler(progress)])
+    # Bad input is one line for scripts; until it is known, warnings wait, except where somebody follows the run.
+    followed = sys.stderr.isatty() or arguments.verbose or arguments.command in ("stream", "batch")
+    log = MemoryHandler(1000, logging.DEBUG if followed else logging.CRITICAL, _LogHandler(progress))
+    logging.basicConfig(level=level, handlers=[log])
     try:
         with progress:
             said = _run(arguments, progress)
@@ -46,9 +50,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     except ReconstructionError as error:
         return _complain(f"error: {error}", NOT_RECONSTRUCTED)
     except FactorsfmError as error:
+        log.buffer.clear()
         return _complain(f"error: {error}", BAD_INPUT)
     except KeyboardInterrupt:
         return _complain("interrupted", INTERRUPTED)
+    finally:
+        log.flush()
     return 0
 
 
@@ -74,7 +81,7 @@ def _run(arguments: argparse.Namespace, progress: _Progress) -> str:
 def _reconstruct(arguments: argparse.Namespace, progress: _Progress) -> str:
     check_directory(arguments.output)
     camera = read_camera(arguments.camera) if arguments.camera else None
-    frames = parse_range(arguments.frames) if arguments.frames else None
+    frames = parse_range(arguments.frames) if arguments.frames is not None else None
     start = time.perf_counter()
     try:
         reconstruction = api.reconstruct(
@@ -108,7 +115,7 @@ def _extend(arguments: argparse.Namespace, progress: _Progress) -> str:
         arguments.result,
         arguments.images,
         source=arguments.source,
-        frames=parse_range(arguments.frames) if arguments.frames else None,
+        frames=parse_range(arguments.frames) if arguments.frames is not None else None,
         refine=arguments.refine,
         work=arguments.work,
         progress=progress,
@@ -175,6 +182,7 @@ class _LogHandler(logging.StreamHandler[TextIO]):
 
     def __init__(self, progress: _Progress) -> None:
         super().__init__()
+        self.setFormatter(logging.Formatter("%(levelname)s %(name)s: %(message)s"))
         self._progress = progress
 
     def emit(self, record: logging.LogRecord) -> None:

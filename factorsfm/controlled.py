@@ -23,6 +23,7 @@ from factorsfm.control_term import (
     View,
 )
 from factorsfm.datum import Correspondences, start_datum
+from factorsfm.errors import ReconstructionError
 from factorsfm.evaluation.alignment import Similarity
 from factorsfm.marginals import Marginals
 from factorsfm.problem import Observations, State
@@ -38,6 +39,7 @@ logger = logging.getLogger(__name__)
 _KERNEL, _WIDE = 3.0, 1e6  # Cauchy scale of the control, standard deviations; and practically none
 _CONTRADICTION = 4.0  # standard deviations
 _DATUM_STEPS, _STEPS, _TOLERANCE = 30, 25, 2e-5
+_COLLAPSE = 10.0  # fall of the logarithm of the scale with which a scene vanishes
 _POINT_STEPS = 5  # of the points alone, after cameras were put where they are held
 _EXACT = 1e-5  # of the extent of what is known: sigma of exact poses where the datum starts
 _EXACT_DEG = 1e-3
@@ -118,7 +120,8 @@ def controlled(adjustment: BundleAdjustment, located: LocatedControl, frames: li
         adjustment: the free solution; frames: position of each of its frames in the source.
 
     Raises:
-        ReconstructionError: what is known of the registered frames leaves open where the scene is.
+        ReconstructionError: what is known of the registered frames leaves open where the scene is, or contradicts
+            the images so much that the scene vanishes.
     """
     known = _Known(located, frames, adjustment.state)
     placed = bool(located.control.poses) or any(point.position is not None for point in located.control.points)
@@ -129,6 +132,7 @@ def controlled(adjustment: BundleAdjustment, located: LocatedControl, frames: li
         state = moved.solve(_POINT_STEPS)
     sizes = [float(np.linalg.norm(r)) for r in term.residuals(state)]
     typical = float(np.median(sizes)) if sizes else 0.0
+    begin = float(state.control[6])  # log of the scale
     solved = adjustment
     # From afar the kernel must not take all control for wrong.
     for kernel in sorted({max(_KERNEL, 2.0 * typical), _KERNEL}, reverse=True):
@@ -139,6 +143,14 @@ def controlled(adjustment: BundleAdjustment, located: LocatedControl, frames: li
         )  # fmt: skip
         state = solved.solve()
         logger.debug("control: kernel %.1f sigma, %d iterations", kernel, solved.iterations)
+    if state.control[6] < begin - _COLLAPSE:
+        worst = max(
+            zip(term.items, term.residuals(state), strict=True), key=lambda pair: float(np.linalg.norm(pair[1]))
+        )
+        raise ReconstructionError(
+            "control: it contradicts the images so much that the scene shrinks to a point; "
+            f"{worst[0].name} is then off by {np.linalg.norm(worst[1]):.0f} sigma"
+        )
     return _described(solved, term, known, placed)
 
 

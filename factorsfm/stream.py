@@ -52,6 +52,7 @@ logger = logging.getLogger(__name__)
 
 _STATE = ("_size", "_lens_given", "_colors", "_pixels", "_without_depth")
 _REVIVAL_INTERVAL = 5  # frames
+_LEAST_SIDE = 32  # pixels: room for the patches of the tracker
 
 
 @dataclass(frozen=True, slots=True)
@@ -345,6 +346,8 @@ class Stream(Closing):
     def _open(self, frame: Frame) -> Mapper:
         """Everything that waits for the size of the first frame."""
         height, width = frame.image.shape[:2]
+        if min(height, width) < _LEAST_SIDE:
+            raise InputError(f"the images have {width}x{height} pixels; at least {_LEAST_SIDE} on each side are needed")
         if self.camera is None:
             self.camera = guess_camera(width, height, frame.path)
             self.options = self.options.for_unknown_lens()

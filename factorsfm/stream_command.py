@@ -95,7 +95,7 @@ def run(arguments: argparse.Namespace, progress: Progress, show: Show) -> str:
     _check(arguments)
     begin = time.perf_counter()
     camera = read_camera(arguments.camera) if arguments.camera else None
-    frames = parse_range(arguments.frames) if arguments.frames else None
+    frames = parse_range(arguments.frames) if arguments.frames is not None else None
     raw = RawFormat.parse(arguments.raw) if arguments.raw else None
     options = replace(Options.preset_named(arguments.preset), lens=arguments.lens)
     depth = open_depth(unless_none(arguments.depth), arguments.depth_kind) if options.uses_depth else None

@@ -110,8 +110,8 @@ def _why_unordered(paths: list[Path]) -> str:
 
 def _trackable_share(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> float:
     """Share of the corners of the first image that are tracked to the second and back, and look the same there."""
-    if image_texture(cv2.cvtColor(first, cv2.COLOR_BGR2GRAY)) < BLANK_TEXTURE:
-        return 1.0  # a blank image says nothing
+    if min(first.shape[:2]) < _PATCH or image_texture(cv2.cvtColor(first, cv2.COLOR_BGR2GRAY)) < BLANK_TEXTURE:
+        return 1.0  # a blank image says nothing, nor does one that holds no patch
     size = (_SAMPLED_WIDTH, max(1, round(_SAMPLED_WIDTH * first.shape[0] / first.shape[1])))
     small = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (first, second))
     a, b = (cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) for image in small)

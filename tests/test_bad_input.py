@@ -173,6 +173,15 @@ def test_frames_that_the_source_does_not_have(cli: Cli) -> None:
     cli.refuses("is empty; STOP must be larger", source, "--frames", "2:1")
 
 
+@pytest.mark.parametrize(("height", "width"), [(1, 480), (16, 16), (400, 20)])
+def test_images_without_room_for_a_patch(height: int, width: int, cli: Cli) -> None:
+    images = [np.random.default_rng(0).integers(0, 255, (height, width, 3), np.uint8)] * 3
+    words = f"the images have {width}x{height} pixels; at least 32 on each side are needed"
+    cli.refuses(words, write_images(cli.folder / "images", images))
+    with pytest.raises(InputError, match=words):
+        reconstruct(images, camera=None)
+
+
 def test_no_frames_in_a_sequence() -> None:
     with pytest.raises(InputError, match="holds no frames"):
         reconstruct([])

@@ -1,6 +1,7 @@
 """Which cells are measured on which data."""
 
 import pytest
+
 from benchmarks import run
 from benchmarks.plan import COLMAP, EXPERIMENTS, OTHERS, planned
 

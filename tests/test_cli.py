@@ -203,6 +203,24 @@ def test_verbose_stands_before_or_after_the_command(
     assert logging.getLogger().level == level
 
 
+@pytest.mark.parametrize("raised", [InputError("no"), ReconstructionError("no"), None])
+def test_warnings_of_bad_input_do_not_stand_beside_its_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], raised: Exception | None
+) -> None:
+    def reconstruct(*_: Any, **__: Any) -> Any:
+        logging.getLogger("factorsfm").warning("a guess")
+        if raised is not None:
+            raise raised
+        return build()
+
+    monkeypatch.setattr("factorsfm.api.reconstruct", reconstruct)
+    logging.getLogger().handlers.clear()  # else logging is taken as configured
+    main(["reconstruct", "shot.mp4", "--output", str(tmp_path / "out")])
+    said = capsys.readouterr().err
+    assert said.startswith("factorsfm: error: no") or "WARNING factorsfm: a guess\n" in said
+    assert ("a guess" in said) != isinstance(raised, InputError)
+
+
 def test_interrupt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     fail_with(monkeypatch, KeyboardInterrupt())
     assert main(["reconstruct", "shot.mp4", "--output", str(tmp_path / "out")]) == 130

@@ -256,6 +256,14 @@ def unit_of(result: Polished, problem: Problem) -> float:
     return float(np.median(result.state.inverse_distance / problem.truth.inverse_distance[result.tracks]))
 
 
+def test_control_that_turns_the_path_round_leaves_no_scene(exact: Problem) -> None:
+    """The cameras as they look, but moved the other way: the best scale is none."""
+    moved = true_centers(exact)[9] - true_centers(exact)[0]
+    known = [known_pose(exact, 0, SIGMA, 0.01), known_pose(exact, 9, SIGMA, noise=-2.0 * moved)]
+    with pytest.raises(ReconstructionError, match=r"the scene shrinks to a point; position of .* off by \d+ sigma"):
+        solve(exact, Control(known))
+
+
 def test_a_distance_alone_gives_the_scale(exact: Problem) -> None:
     length = float(np.linalg.norm(true_centers(exact)[0] - true_centers(exact)[9]))
     result = solve(exact, Control(distances=[KnownDistance(length, SIGMA, (10, 19))]))

@@ -274,7 +274,7 @@ def test_auc_refuses_bad_threshold():
 
 def test_parallax_counts_from_the_first_registered_camera():
     centers = np.array([[np.nan] * 3, [1.0, 0, 0], [1, 0.3, 0], [1, 0, -0.4]])
-    assert parallax(centers, [2.0, 4.0, 8.0, np.nan]) == pytest.approx(0.1)
+    assert parallax(centers, [2.0, 4.0, 8.0, np.nan, 0.0, -3.0]) == pytest.approx(0.1)
     with pytest.raises(InputError, match="0 cameras, 1 depths"):
         parallax(centers[:1], [1.0])
 

@@ -165,6 +165,14 @@ def test_family_by_file_name(name: str, family: str | None) -> None:
     assert network_family(Path(name)) == family
 
 
+def test_a_named_network_is_known_under_any_name(shared_models: Path, tmp_path: Path) -> None:
+    renamed = tmp_path / "model.onnx"
+    shutil.copyfile(shared_models / models.MODELS["tcmonodepth"].file, renamed)
+    assert network_family(renamed) == "tcmonodepth"
+    renamed.write_bytes(renamed.read_bytes() + b"x")
+    assert network_family(renamed) is None
+
+
 def test_preprocessing_exactly(tmp_path: Path) -> None:
     spec = NetworkSpec(value_max=255.0, mean=(1.0, 2.0, 3.0), std=(2.0, 4.0, 8.0), size=(2, 3))
     image = np.arange(18, dtype=np.uint8).reshape(2, 3, 3)

@@ -143,7 +143,7 @@ def parallax(centers: Array, depths: ArrayLike) -> float:
 
     Args:
         centers: (n, 3); unregistered frames NaN.
-        depths: (m,) depths of the points in the cameras; NaN entries do not count.
+        depths: (m,) depths of the points in the cameras; NaN entries, and points behind the camera, do not count.
 
     Raises:
         InputError: no registered frame, or no depth.
@@ -151,7 +151,7 @@ def parallax(centers: Array, depths: ArrayLike) -> float:
     known = np.asarray(centers, np.float64)
     known = known[registered_frames(known)]
     z = np.asarray(depths, np.float64).ravel()
-    z = z[np.isfinite(z)]
+    z = z[np.isfinite(z) & (z > 0)]
     if not len(known) or not len(z):
         raise InputError(f"parallax needs cameras and depths: {len(known)} cameras, {len(z)} depths given")
     return float(np.linalg.norm(known - known[0], axis=1).max() / np.median(z))

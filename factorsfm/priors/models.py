@@ -83,6 +83,12 @@ def find_model(path_or_name: str | Path) -> Path:
     return path
 
 
+def named_model(path: Path) -> str | None:
+    """The name of a named network by the checksum of its file, None for any other file."""
+    digest = pooch.file_hash(str(path), alg="sha256") if path.is_file() else ""
+    return next((name for name, model in MODELS.items() if model.sha256 == digest), None)
+
+
 def _find_named(name: str) -> Path:
     for folder in model_folders():
         path = folder / MODELS[name].file

@@ -14,6 +14,7 @@ import onnxruntime
 from numpy.typing import NDArray
 
 from factorsfm.errors import ModelError
+from factorsfm.priors.models import named_model
 
 logger = logging.getLogger(__name__)
 
@@ -94,9 +95,13 @@ _FAMILY_PATTERNS = {
 
 
 def network_family(path: Path) -> str | None:
-    """Key of `NETWORK_SPECS` that the file name contains ("Depth-Anything-v2": depth_anything), or None."""
+    """Key of `NETWORK_SPECS` that the file name contains ("Depth-Anything-v2": depth_anything), or None.
+
+    A named network is known by its checksum under any file name.
+    """
     name = re.sub(r"[-_. ]+", "-", path.stem.lower())
-    return next((family for family, pattern in _FAMILY_PATTERNS.items() if re.search(pattern, name)), None)
+    by_name = (family for family, pattern in _FAMILY_PATTERNS.items() if re.search(pattern, name))
+    return next(by_name, None) or named_model(path)
 
 
 class Network:
