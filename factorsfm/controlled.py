@@ -144,12 +144,11 @@ def controlled(adjustment: BundleAdjustment, located: LocatedControl, frames: li
         state = solved.solve()
         logger.debug("control: kernel %.1f sigma, %d iterations", kernel, solved.iterations)
     if state.control[6] < begin - _COLLAPSE:
-        worst = max(
-            zip(term.items, term.residuals(state), strict=True), key=lambda pair: float(np.linalg.norm(pair[1]))
-        )
+        residuals = [_residual(item, r) for item, r in zip(term.items, term.residuals(state), strict=True)]
+        worst = max(residuals, key=lambda residual: residual.sigmas)
         raise ReconstructionError(
             "control: it contradicts the images so much that the scene shrinks to a point; "
-            f"{worst[0].name} is then off by {np.linalg.norm(worst[1]):.0f} sigma"
+            f"{worst.name} is then off by {worst.sigmas:.0f} sigma"
         )
     return _described(solved, term, known, placed)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import logging
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.errors import InputError
+
+logger = logging.getLogger(__name__)
 
 _SEEK_FROM = 100  # frames, that are decoded sooner than the file is looked through
 _COMPARED = 16  # frames at the start of the file whose times must be those of its packets
@@ -29,7 +32,7 @@ def has_timestamps(path: Path) -> bool:
     """
     with _open(path) as video:
         if not video.grab():
-            raise InputError(f"{path} cannot be decoded as a video; it is damaged or not a video")
+            raise InputError(f"{path} cannot be decoded as a video; {_why_not(video)}")
         return bool(video.grab() and video.get(cv2.CAP_PROP_POS_MSEC) > 0)
 
 
@@ -50,7 +53,10 @@ def decode(path: Path, selection: slice, *, timed: bool) -> Iterator[tuple[int, 
             if not ready:
                 video.open(str(path))
         for index in itertools.count(selection.start if ready else 0):
-            if (last is not None and index > last) or not (ready or video.grab()):
+            if last is not None and index > last:
+                return
+            if not (ready or video.grab()):
+                _compare(index, video.get(cv2.CAP_PROP_FRAME_COUNT), path)
                 return
             ready = False
             if index < selection.start or (index - selection.start) % selection.step:
@@ -60,6 +66,24 @@ def decode(path: Path, selection: slice, *, timed: bool) -> Iterator[tuple[int, 
             if not decoded:
                 raise InputError(f"frame {index} of {path} cannot be decoded")
             yield index, np.asarray(image, np.uint8), timestamp
+
+
+def _why_not(video: cv2.VideoCapture) -> str:
+    """What is wrong with a file that yields no frame."""
+    if not video.isOpened():
+        return "it is damaged or not a video"
+    codec = (int(video.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF).to_bytes(4, "little").decode("ascii", "replace").strip()
+    return f"it is damaged, or this build of OpenCV lacks its codec ({codec}); convert it to H.264"
+
+
+def _compare(frames: int, announced: float, path: Path) -> None:
+    """Say so where a file ends well before what its container announces, which is not exact."""
+    if frames < 0.95 * announced - 1.0:
+        logger.warning(
+            "%s: only %d of the %.0f frames that the container announces can be read; the others are damaged, missing, "
+            "or hidden by an edit",
+            path, frames, announced,
+        )  # fmt: skip
 
 
 def _found(video: cv2.VideoCapture, path: Path, index: int) -> bool:

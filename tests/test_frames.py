@@ -1,4 +1,5 @@
 import itertools
+import logging
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
@@ -243,6 +244,21 @@ def test_file_that_is_no_video_is_refused_at_the_call(tmp_path, content, capfd):
     with pytest.raises(InputError, match=r"shot1\.mp4 cannot be decoded as a video"):
         read_frames(path)
     assert capfd.readouterr().err == ""
+
+
+def test_a_video_that_was_cut_off_says_so(tmp_path, caplog):
+    """AVI is read without its index, which stands at the end."""
+    path = tmp_path / "shot.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 25, (64, 48))
+    for _ in range(20):
+        writer.write(RNG.integers(0, 255, (48, 64, 3), np.uint8))
+    writer.release()
+    with caplog.at_level(logging.WARNING):
+        assert len(list(read_frames(path))) == 20
+    assert not caplog.records
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    assert 1 < (read := len(list(read_frames(path)))) < 12
+    assert f"shot.avi: only {read} of the 20 frames" in caplog.text
 
 
 def test_single_image_file_is_refused_at_the_call(tmp_path):
