@@ -14,9 +14,10 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from factorsfm.camera import open_camera
 from factorsfm.control import Control, find_frames, read_control
 from factorsfm.errors import InputError
-from factorsfm.frames import Frame, list_images, read_frames
+from factorsfm.frames import Frame, checked_range, list_images, read_frames
 from factorsfm.image_set import ImageSet
 from factorsfm.options import LensFreedom, Options
 from factorsfm.priors.depth import DepthFolder, DepthKind, DepthPrior, open_depth
@@ -31,7 +32,7 @@ Progress = Callable[[str, int, int | None], None]
 def reconstruct(
     source: str | Path | Iterable[Frame | NDArray[np.uint8]],
     *,
-    camera: pycolmap.Camera | None = None,
+    camera: str | Path | pycolmap.Camera | None = None,
     depth: str | Path | DepthPrior | None = "tcmonodepth",
     depth_kind: DepthKind | str | None = None,
     masks: str | Path | MaskPrior | None = None,
@@ -51,7 +52,7 @@ def reconstruct(
 
     Args:
         source: a video file, a folder of images, or any iterable of 8-bit images (BGR or grey) or `Frame`s.
-        camera: the lens; None takes EXIF or a guess.
+        camera: the lens, or its JSON file; None takes EXIF or a guess.
         depth: a network (ONNX file), a named model, a folder of maps, any `DepthPrior`, or None.
         depth_kind: what the prior holds, where it cannot be known.
         masks: a folder, a segmentation network, any `MaskPrior`, or None.
@@ -75,6 +76,8 @@ def reconstruct(
     if lens not in get_args(LensFreedom):
         raise InputError(f"unknown lens '{lens}', expected one of {', '.join(get_args(LensFreedom))}")
     options = replace(Options.preset_named(preset), lens=lens)
+    camera = open_camera(camera)
+    frames = checked_range(frames) if frames is not None else None
     prior = open_depth(depth, depth_kind) if options.uses_depth else None
     mask_prior = open_masks(masks)
     known = read_control(control) if isinstance(control, str | Path) else control

@@ -58,6 +58,19 @@ def read_camera(path: str | Path) -> pycolmap.Camera:
         raise InputError(f"camera file {path}: {error}") from error
 
 
+def open_camera(camera: str | Path | pycolmap.Camera | None) -> pycolmap.Camera | None:
+    """The camera that a user means: itself, or that of a camera file.
+
+    Raises:
+        InputError: it is neither, or as in `read_camera`.
+    """
+    if isinstance(camera, str | Path):
+        return read_camera(camera)
+    if camera is not None and not isinstance(camera, pycolmap.Camera):
+        raise InputError(f"the camera is of type {type(camera).__name__}; a pycolmap.Camera or a file is expected")
+    return camera
+
+
 def camera_to_json(camera: pycolmap.Camera) -> dict[str, Any]:
     """The content of a camera file, as `read_camera` reads it."""
     return {

@@ -173,7 +173,10 @@ class _Extension:
                 continue
             self._new.append(self._view(image, frame, row))
         if not self._new:
-            raise InputError(f"there is no image to add in {images if path is not None else 'the sequence of images'}")
+            unusable = [f for f in self._frames[len(self._base.frames) :] if f.status is FrameStatus.UNUSABLE]
+            why = f": {unusable[-1].name} is unusable, {unusable[-1].message}" if unusable else ""
+            where = images if path is not None else "the sequence of images"
+            raise InputError(f"there is no image to add in {where}{why}")
         if not own:
             self._added.append({"source": None if path is None else str(path), "first": first})
 

@@ -117,8 +117,10 @@ def checked_range(frames: slice) -> slice:
     """The same range with START and STEP filled in.
 
     Raises:
-        InputError: a negative number, a step of zero, or a range that holds no frame.
+        InputError: no slice, a negative number, a step of zero, or a range that holds no frame.
     """
+    if not isinstance(frames, slice):
+        raise InputError(f"frames is {frames!r}; a slice is expected, such as slice(0, 100, 2)")
     start, stop, step = frames.start or 0, frames.stop, 1 if frames.step is None else frames.step
     text = _range_text(frames)
     if start < 0 or (stop is not None and stop < 0) or step < 0:

@@ -10,6 +10,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from factorsfm.camera import open_camera
 from factorsfm.closing import Closing
 from factorsfm.frame_update import FrameUpdate
 from factorsfm.frames import Frame
@@ -49,7 +50,7 @@ class Live(Closing, Iterator[FrameUpdate]):
 def track(
     source: str | Path | int | BinaryIO | Iterable[NDArray[np.uint8] | Frame],
     *,
-    camera: pycolmap.Camera | None = None,
+    camera: str | Path | pycolmap.Camera | None = None,
     depth: str | Path | DepthPrior | None = "tcmonodepth",
     depth_kind: DepthKind | str | None = None,
     masks: str | Path | MaskPrior | None = None,
@@ -76,5 +77,5 @@ def track(
     """
     options = Options.preset_named(preset)
     prior = open_depth(depth, depth_kind) if options.uses_depth else None
-    stream = Stream(camera, depth=prior, masks=open_masks(masks), options=options)
+    stream = Stream(open_camera(camera), depth=prior, masks=open_masks(masks), options=options)
     return Live(open_source(source, frames=frames, raw=raw, watch=watch, drop=drop), stream)

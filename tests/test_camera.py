@@ -11,6 +11,7 @@ from factorsfm.camera import (
     check_camera,
     guess_camera,
     normalized_from_pixels,
+    open_camera,
     pixels_from_normalized,
     read_camera,
 )
@@ -118,6 +119,13 @@ def test_bad_file_is_refused_in_one_sentence(tmp_path, content, reason):
 def test_a_byte_order_mark_is_no_part_of_the_file(tmp_path):
     (tmp_path / "camera.json").write_text(json.dumps(PLAIN), encoding="utf-8-sig")
     assert read_camera(tmp_path / "camera.json").width == PLAIN["width"]
+
+
+def test_a_camera_is_itself_or_its_file(tmp_path):
+    camera = open_camera(write(tmp_path / "camera.json", PLAIN))
+    assert camera.width == 640
+    assert open_camera(camera) is camera
+    assert open_camera(None) is None
 
 
 def test_missing_file_and_folder_are_refused(tmp_path):

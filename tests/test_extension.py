@@ -234,6 +234,8 @@ def test_there_must_be_something_to_add(material: Set) -> None:
         add_images(material.result, [Frame(0, material.shot.images[0], "o_0.png")])
     with pytest.raises(InputError, match="there is no image to add"):
         add_images(material.result, material.folder / "old")
+    with pytest.raises(InputError, match="there is no image to add in .*: 000000 is unusable, 99x180 pixels"):
+        add_images(material.result, [material.shot.images[0][:, :99]], source=material.folder / "old")
 
 
 def test_a_camera_that_does_not_move_has_no_points_to_register_on(tmp_path: Path) -> None:
