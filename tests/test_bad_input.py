@@ -192,7 +192,7 @@ def test_arguments_that_name_nothing() -> None:
         reconstruct(rendered("dolly").images, "tcmonodepth", depth_kind="far")
     with pytest.raises(InputError, match="unknown preset 'best'"):
         reconstruct(rendered("dolly").images, preset="best")
-    with pytest.raises(InputError, match="the camera is of type int; a pycolmap.Camera or a file is expected"):
+    with pytest.raises(InputError, match=r"the camera is of type int; a pycolmap\.Camera or a file is expected"):
         reconstruct(rendered("dolly").images, camera=35)
     with pytest.raises(InputError, match=r"frames is \(0, 5\); a slice is expected"):
         reconstruct(rendered("dolly").images, frames=(0, 5))

@@ -234,7 +234,7 @@ def test_there_must_be_something_to_add(material: Set) -> None:
         add_images(material.result, [Frame(0, material.shot.images[0], "o_0.png")])
     with pytest.raises(InputError, match="there is no image to add"):
         add_images(material.result, material.folder / "old")
-    with pytest.raises(InputError, match="there is no image to add in .*: 000000 is unusable, 99x180 pixels"):
+    with pytest.raises(InputError, match=r"there is no image to add in .*: 000000 is unusable, 99x240 pixels"):
         add_images(material.result, [material.shot.images[0][:, :99]], source=material.folder / "old")
 
 
