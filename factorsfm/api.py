@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import pycolmap
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from factorsfm.camera import open_camera
 from factorsfm.control import Control, find_frames, read_control
 from factorsfm.errors import InputError
-from factorsfm.frames import Frame, checked_range, list_images, read_frames
+from factorsfm.frames import Frame, checked_range, list_images, range_text, read_frames
 from factorsfm.image_set import ImageSet
 from factorsfm.options import LensFreedom, Options
 from factorsfm.priors.depth import DepthFolder, DepthKind, DepthPrior, open_depth
@@ -95,7 +95,18 @@ def reconstruct(
         part.options["source"] = str(source) if isinstance(source, str | Path) else "frames"
         part.options["unordered"] = unordered
         part.options["features"] = str(features)
+        part.options |= input_options(prior, mask_prior, frames)
     return result
+
+
+def input_options(depth: DepthPrior | None, masks: MaskPrior | None, frames: slice | None) -> dict[str, Any]:
+    """What is written beside the options of a result: the names of its priors, and its range."""
+    return {
+        "depth": depth.name if depth is not None else None,
+        "depth_kind": str(depth.kind) if depth is not None else None,
+        "masks": getattr(masks, "name", type(masks).__name__) if masks is not None else None,
+        "frames": range_text(frames) if frames is not None else None,
+    }
 
 
 def _from_shot(

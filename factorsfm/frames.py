@@ -122,7 +122,7 @@ def checked_range(frames: slice) -> slice:
     if not isinstance(frames, slice):
         raise InputError(f"frames is {frames!r}; a slice is expected, such as slice(0, 100, 2)")
     start, stop, step = frames.start or 0, frames.stop, 1 if frames.step is None else frames.step
-    text = _range_text(frames)
+    text = range_text(frames)
     if start < 0 or (stop is not None and stop < 0) or step < 0:
         raise InputError(f"frame range {text} holds a negative number; frames are counted from 0")
     if step == 0:
@@ -132,7 +132,8 @@ def checked_range(frames: slice) -> slice:
     return slice(start, stop, step)
 
 
-def _range_text(frames: slice) -> str:
+def range_text(frames: slice) -> str:
+    """As `parse_range` takes it."""
     start, stop = ("" if part is None else str(part) for part in (frames.start, frames.stop))
     return f"{start}:{stop}" + ("" if frames.step is None else f":{frames.step}")
 

@@ -8,14 +8,14 @@ import math
 import signal
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from factorsfm.api import check_matched
+from factorsfm.api import check_matched, input_options
 from factorsfm.camera import camera_to_json, read_camera
 from factorsfm.episode import Episode, ShotResult
 from factorsfm.errors import InputError, ReconstructionError
@@ -113,7 +113,7 @@ def run(arguments: argparse.Namespace, progress: Progress, show: Show) -> str:
             stall_seconds=arguments.stall_seconds,
         ) as source:
             target: Stream | Episode | None = resumed
-            end = _End(arguments, source, begin)
+            end = _End(arguments, source, begin, input_options(depth, masks, frames))
             incoming = _after(source, resumed, arguments.source) if resumed is not None else source
             with _first_interrupt() as interrupt:
                 line = _Line(show, source, arguments.cuts)
@@ -170,7 +170,8 @@ class _Line:
 class _End:
     """Writes what has come of the frames."""
 
-    def __init__(self, arguments: argparse.Namespace, source: Source, begin: float) -> None:
+    def __init__(self, arguments: argparse.Namespace, source: Source, begin: float, inputs: Mapping[str, Any]) -> None:
+        self._inputs = inputs
         self._output: Path = arguments.output
         self._source = source
         self._begin = begin
@@ -212,7 +213,7 @@ class _End:
         if self._source.dropped:
             reconstruction.notes.append(f"Frames dropped because tracking was slower: {self._source.dropped}.")
         reconstruction.seconds |= self._seconds()
-        reconstruction.options["source"] = self._given["source"]
+        reconstruction.options |= {"source": self._given["source"], **self._inputs}
         return reconstruction
 
     def _seconds(self) -> dict[str, float]:

@@ -70,6 +70,9 @@ def test_a_stream_gives_the_result_of_the_one_call(
     np.testing.assert_array_equal(trajectory(tmp_path / "out"), trajectory(tmp_path / "once"))
     streamed, once = summary(tmp_path / "out"), summary(tmp_path / "once")
     assert streamed["source"] == once["source"] == str(tmp_path / "images")
+    known = {"depth": "depth", "depth_kind": "inverse", "masks": None, "frames": None}
+    assert known.items() <= streamed["options"].items()
+    assert known.items() <= once["options"].items()
     assert (streamed["points"], streamed["notes"]) == (once["points"], once["notes"])
     assert 0.0 < streamed["seconds"]["total"] < TIMEOUT
 
