@@ -303,6 +303,9 @@ def read_image(path: Path) -> NDArray[np.uint8]:
         raise InputError(f"image {path} is truncated")
     with quiet_opencv():
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+        other = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data and image is None else None
+    if other is not None:
+        raise InputError(f"image {path} has pixels of {other.dtype}; 8 or 16 bits a channel are expected")
     if image is None:
         raise InputError(f"image {path} cannot be decoded; it is damaged, truncated or not an image")
     return np.asarray(image, dtype=np.uint8)

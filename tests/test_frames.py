@@ -246,6 +246,12 @@ def test_file_that_is_no_video_is_refused_at_the_call(tmp_path, content, capfd):
     assert capfd.readouterr().err == ""
 
 
+def test_pixels_of_another_type_are_named(tmp_path):
+    cv2.imwrite(str(tmp_path / "0.tif"), image(50).astype(np.float32))
+    with pytest.raises(InputError, match=r"0\.tif has pixels of float32; 8 or 16 bits a channel"):
+        next(read_frames(tmp_path))
+
+
 def test_a_video_that_was_cut_off_says_so(tmp_path, caplog):
     """AVI is read without its index, which stands at the end."""
     path = tmp_path / "shot.avi"
