@@ -28,10 +28,12 @@ from factorsfm.frames import (
     Frame,
     bgr_image,
     checked_range,
+    list_images,
     read_frames,
     uniform,
     watch_folder,
 )
+from factorsfm.unordered import Unusable, read_images
 from factorsfm.video import quiet_opencv
 
 logger = logging.getLogger(__name__)
@@ -104,9 +106,9 @@ def open_source(
     """Open a source and begin to read it beside the consumer.
 
     Args:
-        source: a video file, a folder of images or an iterable, as in `read_frames`; a camera (its number, or
-            "camera:0"); the URL of a network stream (anything with "://"); "-" for standard input, or a binary file
-            object, of raw frames.
+        source: a video file, a folder of images or an iterable, as in `read_frames`, but damaged images of a folder
+            are left out; a camera (its number, or "camera:0"); the URL of a network stream (anything with "://"); "-"
+            for standard input, or a binary file object, of raw frames.
         frames: the part to read; the indices of the frames count in the source.
         raw: size and pixel format of raw frames.
         watch: wait for further images in a folder. They are taken in natural order, each once it is complete; one that
@@ -145,6 +147,8 @@ def open_source(
         if isinstance(source, io.TextIOBase):
             raise InputError(f"{name} was opened as text; a binary file is expected")
         found = _raw_frames(sys.stdin.buffer if source == "-" else source, raw, name, closed)
+    elif isinstance(source, str | Path) and Path(source).is_dir() and list_images(Path(source)):
+        name, found, frames = str(source), _readable(read_images(source, frames and checked_range(frames))), None
     else:
         name = str(source) if isinstance(source, str | Path) else "the sequence of images"
         files = cast("str | Path | Iterable[NDArray[np.uint8] | NDArray[np.uint16] | Frame]", source)
@@ -152,6 +156,15 @@ def open_source(
     selection = checked_range(frames if frames is not None else slice(None))
     chosen = uniform(_chosen(found, selection), name, selection.start)
     return Source(chosen, name, closed, live if drop is None else drop, queue_size, stall_seconds)
+
+
+def _readable(images: Iterator[Frame | Unusable]) -> Iterator[Frame]:
+    """The images of a folder without those that are damaged, which must not end the shot."""
+    for image in images:
+        if isinstance(image, Frame):
+            yield image
+        else:
+            logger.warning("image %s is left out: %s", image.name, image.reason)
 
 
 class Source(Closing, Iterator[Frame]):

@@ -465,6 +465,17 @@ def test_damaged_and_late_images_are_left_out(tmp_path, monkeypatch, caplog):
     ]
 
 
+def test_damaged_images_of_a_folder_are_left_out(tmp_path, caplog):
+    for value in range(6):
+        (tmp_path / f"{value}.png").write_bytes(encoded(10 * value, ".png")[: -20 if value in (0, 3) else None])
+    source = open_source(tmp_path, frames=slice(0, 5))
+    assert [(frame.index, frame.name) for frame in source] == [(1, "1.png"), (2, "2.png"), (4, "4.png")]
+    assert not source.broke_off
+    assert [record.message for record in caplog.records] == [
+        f"image {name} is left out: it is truncated" for name in ("0.png", "3.png")
+    ]
+
+
 def test_an_image_of_another_size_ends_a_watched_folder(tmp_path):
     cv2.imwrite(str(tmp_path / "1.png"), image(1))
     cv2.imwrite(str(tmp_path / "2.png"), image(2)[:20])
