@@ -148,7 +148,8 @@ def open_source(
             raise InputError(f"{name} was opened as text; a binary file is expected")
         found = _raw_frames(sys.stdin.buffer if source == "-" else source, raw, name, closed)
     elif isinstance(source, str | Path) and Path(source).is_dir() and list_images(Path(source)):
-        name, found, frames = str(source), _readable(read_images(source, frames and checked_range(frames))), None
+        name, part = str(source), checked_range(frames if frames is not None else slice(None))
+        found, frames = uniform(_readable(read_images(source, part)), name, part.start), None  # it skips, too
     else:
         name = str(source) if isinstance(source, str | Path) else "the sequence of images"
         files = cast("str | Path | Iterable[NDArray[np.uint8] | NDArray[np.uint16] | Frame]", source)
