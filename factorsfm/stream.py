@@ -124,6 +124,7 @@ class Stream(Closing):
         """
         frame = as_frame(frame, len(self.frames))
         mapper = self._mapper or self._open(frame)
+        focal_changed = self._follow_focal(mapper)
         if frame.image.shape[1::-1] != self._size:
             raise InputError(
                 f"frame {frame.index} is {frame.image.shape[1]}x{frame.image.shape[0]}, "
@@ -135,7 +136,9 @@ class Stream(Closing):
             grey = np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY), np.uint8)
             tracked = self._tracker.track(grey, mask, self._expected(mapper))
         self._remember_colors(frame.image, tracked.ids, tracked.xy)
-        focal_changed = self._advance(mapper)
+        with self._timed("mapping"):
+            mapper.advance()
+        focal_changed |= self._follow_focal(mapper)
         xy = normalized_from_pixels(self.camera, tracked.xy)
         usable = np.isfinite(xy).all(axis=1)  # a distortion model may have no inverse in the corners
         usable &= tracked.texture >= BLANK_TEXTURE  # what is tracked in a blank image is its noise
@@ -143,6 +146,7 @@ class Stream(Closing):
         tracks = ImageTracks(len(self.frames), tracked.ids[usable], xy[usable])
         with self._timed("mapping"):
             image = mapper.add(tracks, lambda: self._read_depth(frame, pixels))
+        focal_changed |= self._follow_focal(mapper)
         self.frames.append(SeenFrame(frame.index, frame.name, frame.timestamp, tracked.texture))
         self._pixels.append(pixels)
         self._thumbnails.add(frame.image)
@@ -254,6 +258,7 @@ class Stream(Closing):
     def _polished(self, mapper: Mapper, progress: Callable[[str, int, int | None], None] | None) -> Reconstruction:
         with self._timed("mapping"):
             mapper.finish()
+        self._follow_focal(mapper)
         control = self._located_control()
         for image, seen in zip(mapper.images, self.frames, strict=True):
             _mark_blank(image, seen.texture)
@@ -358,14 +363,11 @@ class Stream(Closing):
         self._mapper = self._new_mapper()
         return self._mapper
 
-    def _advance(self, mapper: Mapper) -> bool:
-        """Take over what is due; whether the focal length is another one then."""
-        before = mapper.focal
-        with self._timed("mapping"):
-            mapper.advance()
-        if mapper.focal == before:
-            return False
+    def _follow_focal(self, mapper: Mapper) -> bool:
+        """Take over the focal length with which the mapper normalises; whether it is another one."""
         assert self.camera is not None
+        if np.isclose(mapper.focal, self.camera.mean_focal_length(), rtol=1e-12, atol=0.0):
+            return False
         self.camera = with_focal(self.camera, mapper.focal)
         return True
 
