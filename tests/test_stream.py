@@ -22,6 +22,8 @@ from factorsfm import (
     ShotKind,
     Stream,
 )
+from factorsfm.camera import pixels_from_normalized
+from factorsfm.mapper import Mapper
 from factorsfm.synthetic import render_shot, simulate_prior
 
 QUICK = with_fewer_tracks(Options())
@@ -171,6 +173,28 @@ def test_an_unknown_lens_is_guessed_and_estimated():
     assert any("focal length" in note for note in result.notes)
     ratio = result.camera.mean_focal_length() / rendered("dolly").camera.mean_focal_length()
     assert 0.7 < ratio < 1.4  # the guess says 50 degrees, the truth is 54
+
+
+def test_all_frames_are_seen_through_one_focal_length_whenever_the_map_changes_it(monkeypatch):
+    extend = Mapper._extend
+
+    def extend_and_change(mapper, image, read_depth):
+        extend(mapper, image, read_depth)
+        mapper._set_focal(1.01 * mapper.focal)
+
+    monkeypatch.setattr(Mapper, "_extend", extend_and_change)
+    s = stream(camera=None)
+    changed = []
+    for k, image in enumerate(rendered("dolly").images[:8]):
+        if k == 6:
+            s._mapper._set_focal(0.9 * s._mapper.focal)  # between frames, as `trajectory` may
+        update = s.push(image)
+        changed.append(update.focal_changed)
+        assert update.focal_length == pytest.approx(s.camera.mean_focal_length(), rel=1e-12)
+    assert changed == [False] + [True] * 7
+    for image, pixels in zip(s._mapper.images, s._pixels, strict=True):
+        np.testing.assert_allclose(pixels_from_normalized(s.camera, image.tracks.xy), pixels, atol=1e-6)
+    s.close()
 
 
 class Failing(Maps):
