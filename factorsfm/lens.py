@@ -56,6 +56,7 @@ class LensEstimate:
         misfit_px: standard deviation of the tracks where they fit no lens: what an estimate says is chance then;
             0 where they do.
         determined: whether the focal lengths are estimates, not the guess.
+        rough: whether they are not, but the shot knows more than the guess: means of both, each as it is known.
         zoom_std: relative standard deviation of the ratio of the longest to the shortest focal length where a zoom was
             looked for, whether one was found or not; None: none was. The course of a zoom is an estimate in any case.
     """
@@ -66,6 +67,7 @@ class LensEstimate:
     shape_std: Array
     misfit_px: float
     determined: bool
+    rough: bool = False
     zoom_std: float | None = None
 
     def renormalize(self, observations: Observations, group: Index) -> Observations:
@@ -108,13 +110,14 @@ def estimate_lens(
     guess: Lens,
     options: Options,
     focal_prior: tuple[Array, Array] | None = None,
-    fallback: Array | None = None,
+    first_focal: tuple[Array, float] | None = None,
 ) -> tuple[BundleAdjustment, LensEstimate]:
     """The lens where the shot determines it, else what was thought first; and the cameras with it.
 
     Args:
         adjustment: converged with the guess; focal_prior: as in `BundleAdjustment`.
-        fallback: (g,) focal lengths that are kept where the shot determines none, pixels; None: those of the guess.
+        first_focal: (g,) what was thought of the focal lengths first, pixels, and the relative standard deviation of
+            that; None: those of the guess, which are kept where the shot determines none.
 
     Returns:
         The adjustment with undistorted observations, whose `observations` are those of the lens.
@@ -161,22 +164,39 @@ def estimate_lens(
     logger.info("focal length %s pixels within %s %%, guess %s", lens.focal, 100 * focal_std, guess.focal)
     misfit = best.sigma if best.sigma > _MISFIT * o.doubtful_px else 0.0
     far = np.abs(np.log(lens.focal / guess.focal)).max() > np.log(_LARGEST_RATIO)
-    if misfit or far or not known:
-        kept = Lens(guess.focal if fallback is None else fallback, guess.shape)
-        adjustment = BundleAdjustment(
-            through(adjustment.state, kept.focal),
-            renormalized(adjustment.observations, guess, kept, group),
-            options.polish,
-            sigma=adjustment.sigma,
-        )
-        adjustment.solve()
-        return adjustment, LensEstimate(guess, kept, focal_std, np.full(4, np.nan), misfit, False)
-    state = best.state if moves else through(start, lens.focal)
+    known &= not (misfit or far)
+    if known:
+        final, rough = lens, False
+    else:
+        focal, rough = _kept_focal(lens.focal, focal_std, first_focal or (guess.focal, 0.0), counts=not (misfit or far))
+        final = Lens(focal, guess.shape)
+    if known or rough:
+        state, observations, before = best.state if moves else through(start, lens.focal), best.observations, lens
+    else:
+        state, observations, before = adjustment.state, adjustment.observations, guess
+    if final is not before:
+        state, observations = through(state, final.focal), renormalized(observations, before, final, group)
     settled = BundleAdjustment(
-        replace(state, lens=np.zeros(4)), best.observations, options.polish, sigma=best.sigma
+        replace(state, lens=np.zeros(4)), observations, options.polish,
+        sigma=best.sigma if known or rough else adjustment.sigma,
     )  # fmt: skip
     settled.solve()
-    return settled, LensEstimate(guess, lens, focal_std, shape_std, 0.0, True)
+    return settled, LensEstimate(
+        guess, final, focal_std, shape_std if known else np.full(4, np.nan), misfit, known, rough
+    )  # fmt: skip
+
+
+def _kept_focal(found: Array, std: Array, first: tuple[Array, float], *, counts: bool) -> tuple[Array, bool]:
+    """Focal lengths that the shot does not determine, (g,), and whether it has a say in them.
+
+    Where it knows them better than they were known at first, they are the means of the logarithms of both, each weighed
+    by its variance; else those of before.
+    """
+    focal, first_std = first
+    if not counts or float(std.max()) >= first_std:
+        return focal, False
+    share = first_std**2 / (first_std**2 + std**2)
+    return np.asarray(found**share * focal ** (1.0 - share)), True
 
 
 def search_focal(adjustment: BundleAdjustment, guess: Lens, options: PolishOptions) -> Array:

@@ -76,7 +76,7 @@ def polish(
     shape: Array | None = None,
     groups: Index | None = None,
     control: LocatedControl | None = None,
-    first_focal: Array | None = None,
+    first_focal: tuple[Array, float] | None = None,
 ) -> Polished:
     """Triangulate all tracks and minimise over all registered frames.
 
@@ -88,8 +88,7 @@ def polish(
         focal: (g,) focal lengths, pixels; first guesses where the options refine them.
         shape: (4,) distortion of the lens as in `factors.distort` where the options refine the lens; None is none.
         groups: (images,) which of the focal lengths is that of each image; None: all have the first.
-        first_focal: (g,) what was thought of the focal lengths first, to which they return where the shot does not
-            determine them; None: `focal`.
+        first_focal: what was thought of the focal lengths first, as in `estimate_lens`; None: `focal`.
         control: what is known beforehand, its marks normalised as the tracks are; it takes part at the end, and only
             where the camera moves.
 

@@ -57,7 +57,7 @@ def polish_start(
     group: Index,
     frames: list[int],
     options: Options,
-    first_focal: Array | None,
+    first_focal: tuple[Array, float] | None,
     progress: Callable[[str], None],
 ) -> PolishStart:
     """The cameras on the longest tracks, what the shot says of lens, motion and prior, and all tracks that fit it.
@@ -160,14 +160,18 @@ def _world(observations: Observations) -> int:
 
 
 def _estimate_lens(
-    adjustment: BundleAdjustment, guess: Lens, frames: list[int], options: Options, fallback: Array | None
+    adjustment: BundleAdjustment,
+    guess: Lens,
+    frames: list[int],
+    options: Options,
+    first_focal: tuple[Array, float] | None,
 ) -> tuple[BundleAdjustment, LensEstimate]:
     """As `estimate_lens`, with a focal length for every frame where a zoom is asked for and found."""
     zoom = None
     if options.lens == "zoom" and len(guess.focal) == 1:
         zoom = find_zoom(adjustment, guess, np.array(frames, np.float64), options.polish)
     if zoom is None or not zoom.found:
-        adjustment, lens = estimate_lens(adjustment, guess, options, fallback=fallback)
+        adjustment, lens = estimate_lens(adjustment, guess, options, first_focal=first_focal)
         return adjustment, replace(lens, zoom_std=zoom.std if zoom else None)
     zoomed = Lens(np.exp(zoom.adjustment.state.log_focal), guess.shape)
     prior = np.zeros(len(frames)), zoom.information

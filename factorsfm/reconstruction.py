@@ -85,8 +85,9 @@ class LensFit:
     """What the shot says of a lens that was not given. Standard deviations are None where a value is no estimate.
 
     Attributes:
-        determined: whether the focal length is an estimate; otherwise it is the guess.
-        focal_std: standard deviation of the focal length, relative; of a zoom the largest one.
+        determined: whether the shot says what the focal length is; otherwise it is the guess, or the mean of the guess
+            and what the shot says, each weighed as well as it is known.
+        focal_std: standard deviation of the focal length, relative; of a zoom the largest one; None for the guess.
         k1_std, k2_std: of the radial distortion.
         cx_std, cy_std: of the principal point, in focal lengths.
         zoom_std: of the ratio of the longest to the shortest focal length, relative, where a zoom was looked for. The

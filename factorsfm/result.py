@@ -252,6 +252,8 @@ def _lens_note(estimate: LensEstimate) -> str:
             f" It changes from {focals[0]:.0f} to {focals[-1]:.0f} pixels; the ratio of the longest to the shortest is "
             f"{focals.max() / focals.min():.3f} ± {estimate.zoom_std * focals.max() / focals.min():.3f}."
         )
+    if estimate.rough:
+        return f"The focal length is known roughly, and counts as not determined: {focal:.0f} pixels, {std}.{zoom}"
     if not estimate.determined:
         reason = f"this shot does not determine it ({std})"
         if estimate.misfit_px:
@@ -266,5 +268,5 @@ def _lens_note(estimate: LensEstimate) -> str:
 
 def _lens_fit(estimate: LensEstimate) -> LensFit:
     k1, k2, x, y = (float(std) if np.isfinite(std) else None for std in estimate.shape_std)
-    focal_std = float(estimate.focal_std.max()) if estimate.determined else None
+    focal_std = float(estimate.focal_std.max()) if estimate.determined or estimate.rough else None
     return LensFit(estimate.determined, focal_std, k1, k2, x, y, estimate.zoom_std)

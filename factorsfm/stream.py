@@ -34,7 +34,7 @@ from factorsfm.frames import Frame, as_frame
 from factorsfm.graph_process import GraphProcess
 from factorsfm.images import ImageTracks, MappedImage
 from factorsfm.mapper import Mapper
-from factorsfm.options import Options
+from factorsfm.options import GUESSED_FOCAL_STD, TOLD_FOCAL_STD, Options
 from factorsfm.polish import polish
 from factorsfm.priors.depth import DepthKind, DepthPrior
 from factorsfm.priors.masks import MaskPrior
@@ -196,6 +196,7 @@ class Stream(Closing):
             {
                 **{name: getattr(self, name) for name in _STATE},
                 "camera": camera_to_json(self.camera) if self.camera is not None else None,
+                "focal_told": self.camera is not None and self.camera.has_prior_focal_length,
                 "options": self.options.to_dict(),
                 "seconds": dict(self.seconds),
                 "frames": [astuple(frame) for frame in self.frames],
@@ -230,6 +231,7 @@ class Stream(Closing):
             setattr(self, name, state[name])
         if state["camera"] is not None:
             self.camera = camera_from_json(state["camera"])
+            self.camera.has_prior_focal_length = state["focal_told"]
         self.seconds.update(state["seconds"])
         self.frames = [SeenFrame(*frame) for frame in state["frames"]]
         self._tracker.restore(state["tracker"])
@@ -278,7 +280,7 @@ class Stream(Closing):
                 lambda stage: progress(stage, 0, None) if progress else None,
                 lens_shape(self.camera) if self.options.refine_focal_length else None,
                 control=control,
-                first_focal=np.array([mapper.first_focal]),
+                first_focal=(np.array([mapper.first_focal]), self._first_focal_std),
             )
         reconstruction = assemble(
             result,
@@ -298,6 +300,12 @@ class Stream(Closing):
             reconstruction.notes.append(f"Frames that went without depth because the prior failed: {count}; {first}.")
         self._thumbnails.attach(reconstruction.frames)
         return reconstruction
+
+    @property
+    def _first_focal_std(self) -> float:
+        """How well the focal length was known at first."""
+        assert self.camera is not None
+        return TOLD_FOCAL_STD if self._lens_given or self.camera.has_prior_focal_length else GUESSED_FOCAL_STD
 
     def _located_control(self) -> LocatedControl | None:
         if self.control is None:
