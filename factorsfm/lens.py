@@ -133,18 +133,12 @@ def estimate_lens(
     focal = search_focal(adjustment, guess, o)
     start = replace(through(adjustment.state, focal), lens=guess.shape)
     observations = renormalized(adjustment.observations, guess, Lens(focal, guess.shape), group)
-    best = solved_with_lens(start, observations, o, adjustment.sigma, np.zeros(4), focal_prior=focal_prior)
-    motion = classify_motion(best, best.observations, options.polish)
-    moves = motion.kind is ShotKind.GENERAL
-    if not moves:  # a translation that is none would bend with the lens
-        best = solved_with_lens(
-            motion.rotation_only, best.observations, o, best.sigma, np.zeros(4), moves=False, focal_prior=focal_prior
-        )
+    best, moves = _solved_as_it_moves(start, observations, o, adjustment.sigma, np.zeros(4), focal_prior)
     std, _ = _standard_deviations(best)
     known = float(std[:groups].max()) < FOCAL_STD
     if sigmas.any():
-        full = solved_with_lens(
-            best.state, best.observations, o, best.sigma, sigmas, moves=moves, focal_prior=focal_prior
+        full, full_moves = _solved_as_it_moves(
+            best.state, best.observations, o, best.sigma, sigmas, focal_prior, moves=moves
         )
         full_std, evidence = _standard_deviations(full, guess.shape)
         displacement = _displacement(full, guess.shape)
@@ -155,7 +149,7 @@ def estimate_lens(
         wide = _LEAST_DISPLACEMENT * width * float(np.median(full.state.focal))
         usable = full_std[:groups].max() < FOCAL_STD and bool(np.isfinite(full.observations.xy).all())
         if evidence > _LEAST_EVIDENCE and displacement > wide and usable:
-            best, std, known = full, full_std, True
+            best, moves, std, known = full, full_moves, full_std, True
         else:  # a distortion that is not believed may be there all the same: second moment around what is kept
             moved = full.state.log_focal - best.state.log_focal
             known &= float(np.hypot(full_std[:groups], moved).max()) < _OPEN_FOCAL_STD
@@ -250,6 +244,30 @@ def _some_frames(state: State, observations: Observations) -> tuple[State, Obser
     return part, Observations(
         np.searchsorted(frames, frame), np.searchsorted(points, point), observations.xy[keep]
     )  # fmt: skip
+
+
+def _solved_as_it_moves(
+    state: State,
+    observations: Observations,
+    options: PolishOptions,
+    sigma: float,
+    sigmas: Array,
+    focal_prior: tuple[Array, Array] | None,
+    *,
+    moves: bool = True,
+) -> tuple[BundleAdjustment, bool]:
+    """As `solved_with_lens`, and whether the camera moves: a translation that is none would bend with the lens."""
+    best = solved_with_lens(state, observations, options, sigma, sigmas, moves=moves, focal_prior=focal_prior)
+    if not moves:
+        return best, False
+    undistorted = BundleAdjustment(best.state, best.observations, options, sigma=best.sigma)
+    motion = classify_motion(undistorted, best.observations, options)
+    if motion.kind is ShotKind.GENERAL:
+        return best, True
+    still = solved_with_lens(
+        motion.rotation_only, best.observations, options, best.sigma, sigmas, moves=False, focal_prior=focal_prior
+    )
+    return still, False
 
 
 def solved_with_lens(
