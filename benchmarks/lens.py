@@ -1,17 +1,20 @@
-"""Unknown lenses: focal length and poses of each shot without its camera, and shots distorted by a known lens.
+"""Unknown lenses: focal length and poses of each shot without its camera, and shots distorted by known lenses.
 
     python -m benchmarks.lens --data FOLDER --models FOLDER
 
-FOLDER/studiosim and FOLDER/real hold the shots with their truth (`benchmarks.inputs`).
+FOLDER/studiosim and FOLDER/real hold the shots with their truth (`benchmarks.inputs`). Rows that were measured before
+and are not asked for stay as they are (`results/lens.json`).
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -25,15 +28,18 @@ from factorsfm.evaluation.metrics import auc, relative_pose_errors
 from factorsfm.evaluation.readers import read_shot
 from factorsfm.evaluation.truth import Shot
 
-DISTORTED = ("d04", "d07")
-DISTORTION = np.array([-0.15, 0.02, 0.0, 0.0])
+_SEVEN, _TWO = ("d01", "d03", "d04", "d05", "d07", "d08", "d10"), ("d04", "d07")
+DISTORTIONS = {(-0.15, 0.02): _SEVEN, (-0.3, 0.08): _TWO, (0.08, 0.0): _TWO}  # k1, k2, and shots
 _LONGER = 1.005
-RESULT = Path(__file__).parent / "results" / "LENS.md"
+_SCALES = np.linspace(0.95, 1.05, 401)
+_RESULTS = Path(__file__).parent / "results"
+RESULT, ROWS = _RESULTS / "LENS.md", _RESULTS / "lens.json"
+
+Row = dict[str, Any]
 
 
-def distorted_frames(shot: Shot) -> Iterator[factorsfm.Frame]:
+def distorted_frames(shot: Shot, lens: pycolmap.Camera) -> Iterator[factorsfm.Frame]:
     """The frames as a lens with radial distortion would have seen them."""
-    lens = true_lens(shot)
     x, y = np.meshgrid(np.arange(lens.width), np.arange(lens.height))
     uv = normalized_from_pixels(lens, np.stack([x.ravel(), y.ravel()], 1).astype(np.float64))
     source = pixels_from_normalized(shot.camera, uv).reshape(lens.height, lens.width, 2).astype(np.float32)
@@ -42,26 +48,35 @@ def distorted_frames(shot: Shot) -> Iterator[factorsfm.Frame]:
         yield replace(frame, image=np.asarray(image, np.uint8))
 
 
-def true_lens(shot: Shot) -> pycolmap.Camera:
+def true_lens(shot: Shot, k1: float, k2: float) -> pycolmap.Camera:
     """The lens of the distorted shot, just long enough that it sees nothing outside the frames that there are."""
     focal, size = shot.camera.mean_focal_length(), np.array([shot.camera.width, shot.camera.height])
     along, last = np.linspace(0.0, 1.0, 65), size - 1
     rim = [np.stack([along, np.full(65, end)], 1) for end in (0.0, 1.0)]
     edge = np.concatenate([*rim, *(side[:, ::-1] for side in rim)]) * last
     while True:
-        lens = with_lens(shot.camera, focal, DISTORTION)
+        lens = with_lens(shot.camera, focal, np.array([k1, k2, 0.0, 0.0]))
         seen = pixels_from_normalized(shot.camera, normalized_from_pixels(lens, edge))
         if (np.abs(seen - 0.5 * last) <= 0.5 * last + 0.01).all():
             return lens
         focal *= _LONGER
 
 
-def difference_px(lens: pycolmap.Camera, truth: pycolmap.Camera) -> NDArray[np.float64]:
-    """Between the pixels of the same ray in both lenses, over the image."""
+def difference_px(lens: pycolmap.Camera, truth: pycolmap.Camera, scale: float = 1.0) -> NDArray[np.float64]:
+    """Between the pixels of the same ray in both lenses, over the image.
+
+    Args:
+        scale: of the rays' distance from the axis in the lens: what a focal length that is only wrong does to them.
+    """
     x, y = np.meshgrid(np.linspace(0, truth.width - 1, 33), np.linspace(0, truth.height - 1, 19))
     pixels = np.stack([x.ravel(), y.ravel()], 1)
-    uv = normalized_from_pixels(truth, pixels)
+    uv = scale * normalized_from_pixels(truth, pixels)
     return np.asarray(np.linalg.norm(pixels_from_normalized(lens, uv) - pixels, axis=1))
+
+
+def bent_px(lens: pycolmap.Camera, truth: pycolmap.Camera) -> float:
+    """What is left of the median difference when the wrong focal length is taken out: lines that are not straight."""
+    return min(float(np.median(difference_px(lens, truth, scale))) for scale in _SCALES)
 
 
 def pose_auc(result: factorsfm.Reconstruction, shot: Shot) -> str:
@@ -74,67 +89,93 @@ def pose_auc(result: factorsfm.Reconstruction, shot: Shot) -> str:
 
 
 def main() -> None:
-    """Measure the shots and write the tables."""
+    """Measure what is asked for and write the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--models", type=Path, required=True)
-    parser.add_argument("--shots", nargs="+", default=[f"d{k:02d}" for k in range(1, 11)], help="beginnings of names")
+    parser.add_argument("--shots", nargs="*", default=[f"d{k:02d}" for k in range(1, 11)], help="beginnings of names")
+    parser.add_argument("--distorted", nargs="*", default=_SEVEN, help="the same, of those to see through other lenses")
     arguments = parser.parse_args()
     depth = factorsfm.DepthModel(arguments.models / NETWORK_FILES["tcmonodepth"])
-    folders = [f for f in sorted(arguments.data.glob("*/*")) if f.name.startswith(tuple(arguments.shots))]
-    rows = []
+    folders = sorted(arguments.data.glob("*/*"))
+    rows: dict[str, Row] = json.loads(ROWS.read_text()) if ROWS.exists() else {}
+
+    def keep(key: str, row: Row) -> None:
+        rows[key] = row
+        print(key, row, flush=True)
+        ROWS.write_text(json.dumps(dict(sorted(rows.items())), indent=1) + "\n")
+        RESULT.write_text(report(rows))
+
     for folder in folders:
-        shot = read_shot(folder)
-        known = factorsfm.reconstruct(shot.source, camera=shot.camera, depth=depth)
-        begin = time.perf_counter()
-        result = factorsfm.reconstruct(shot.source, depth=depth)
-        seconds = time.perf_counter() - begin
-        rows.append(_row(folder.name, shot, known, result, seconds))
-        print(rows[-1], flush=True)
-    text = [
-        "# Unknown lenses", "",
-        f"`python -m benchmarks.lens --data FOLDER --models FOLDER --shots {' '.join(arguments.shots)}`", "",
-        "Prior: TCMonoDepth. AUC: of the relative poses at 1 / 5 degrees. std: of the focal length.", "",
-        "| shot | parallax | true f | estimate | error % | std % | determined | AUC, lens known | AUC, unknown | s |",
-        "|---|---|---|---|---|---|---|---|---|---|", *rows, "",
-    ]  # fmt: skip
-    text += [
-        f"The same distorted by k1 = {DISTORTION[0]}, k2 = {DISTORTION[1]}, and unknown; the focal length is "
-        "a little longer, so that the image is full:", "",
-        "| shot | focal error % | std % | k1 | k2 | over the image: median, largest px | AUC |",
-        "|---|---|---|---|---|---|---|",
-    ]  # fmt: skip
-    for folder in folders:
-        if folder.name[:3] in DISTORTED:
-            text.append(_distorted_row(folder.name, read_shot(folder), depth))
-            print(text[-1], flush=True)
-    RESULT.write_text("\n".join(text) + "\n")
+        if folder.name.startswith(tuple(arguments.shots)):
+            keep(folder.name, shot_row(read_shot(folder), depth))
+    for (k1, k2), names in DISTORTIONS.items():
+        for folder in folders:
+            if folder.name.startswith(names) and folder.name.startswith(tuple(arguments.distorted)):
+                keep(f"{folder.name} {k1} {k2}", distorted_row(read_shot(folder), depth, k1, k2))
 
 
-def _row(
-    name: str, shot: Shot, known: factorsfm.Reconstruction, result: factorsfm.Reconstruction, seconds: float
-) -> str:
-    fit, truth, focal = result.lens, shot.camera.mean_focal_length(), result.camera.mean_focal_length()
+def shot_row(shot: Shot, depth: factorsfm.DepthModel) -> Row:
+    """The shot with its lens known, and without."""
+    known = factorsfm.reconstruct(shot.source, camera=shot.camera, depth=depth)
+    begin = time.perf_counter()
+    result = factorsfm.reconstruct(shot.source, depth=depth)
+    seconds = time.perf_counter() - begin
+    focal = f"{shot.camera.mean_focal_length():.0f}"
+    return {"parallax": f"{known.parallax:.3f}", "true f": focal, "AUC, lens known": pose_auc(known, shot)} | {
+        **_found(result, shot, shot.camera), "s": f"{seconds:.0f}"
+    }  # fmt: skip
+
+
+def distorted_row(shot: Shot, depth: factorsfm.DepthModel, k1: float, k2: float) -> Row:
+    """The shot as a lens with this distortion would have seen it, without its lens."""
+    truth = true_lens(shot, k1, k2)
+    result = factorsfm.reconstruct(distorted_frames(shot, truth), depth=depth)
+    found, off = result.camera, difference_px(result.camera, truth)
+    k = found.params[3:] if found.model_name == "RADIAL" else (0.0, 0.0)
+    return _found(result, shot, truth) | {
+        "k1": f"{k[0]:.4f}", "k2": f"{k[1]:.4f}",
+        "px: median": f"{np.median(off):.2f}", "largest": f"{off.max():.2f}",
+        "at its own focal length": f"{bent_px(found, truth):.2f}",
+    }  # fmt: skip
+
+
+def _found(result: factorsfm.Reconstruction, shot: Shot, truth: pycolmap.Camera) -> Row:
+    fit = result.lens
     assert fit is not None
-    std = f"{100 * fit.focal_std:.2f}" if fit.focal_std is not None else "-"
-    return (
-        f"| {name} | {known.parallax:.3f} | {truth:.0f} | {focal:.0f} | {100 * (focal / truth - 1):+.2f} | {std} "
-        f"| {'yes' if fit.determined else 'no'} | {pose_auc(known, shot)} | {pose_auc(result, shot)} | {seconds:.0f} |"
-    )
+    error = result.camera.mean_focal_length() / truth.mean_focal_length() - 1
+    return {
+        "error %": f"{100 * error:+.2f}",
+        "std %": f"{100 * fit.focal_std:.2f}" if fit.focal_std is not None else "-",
+        "determined": "yes" if fit.determined else "no",
+        "AUC": pose_auc(result, shot),
+    }
 
 
-def _distorted_row(name: str, shot: Shot, depth: factorsfm.DepthModel) -> str:
-    result = factorsfm.reconstruct(distorted_frames(shot), depth=depth)
-    truth, fit = true_lens(shot), result.lens
-    assert fit is not None
-    off = difference_px(result.camera, truth)
-    focal = result.camera.mean_focal_length() / truth.mean_focal_length()
-    std = f"{100 * fit.focal_std:.2f}" if fit.focal_std is not None else "-"
-    k1, k2 = result.camera.params[3:] if result.camera.model_name == "RADIAL" else (0.0, 0.0)
-    return (
-        f"| {name} | {100 * (focal - 1):+.2f} | {std} | {k1:.4f} | {k2:.4f} | {np.median(off):.2f}, {off.max():.2f} "
-        f"| {pose_auc(result, shot)} |"
-    )
+def report(rows: dict[str, Row]) -> str:
+    """The tables, as Markdown."""
+    plain = {key: row for key, row in rows.items() if " " not in key}
+    bent = {key: row for key, row in rows.items() if " " in key}
+    return "\n".join(
+        [
+            "# Unknown lenses", "",
+            "`python -m benchmarks.lens --data FOLDER --models FOLDER`, and the real sets with `--shots NAME ...`", "",
+            "Prior: TCMonoDepth. AUC: relative poses at 1 / 5 degrees. std: of the focal length. Not determined: not "
+            "certain enough to count as an estimate; without a std the first guess is kept.", "",
+            *_table("shot", plain),
+            "The same seen through lenses with distortion k1, k2, and unknown; the focal length is a little longer, so "
+            "that the image is full. px: between the pixels of the same ray in the true and in the found lens, over "
+            "the image; at its own focal length: the median of what is left when the error of the focal length is "
+            "taken out.", "",
+            *_table("shot, k1, k2", bent),
+        ]
+    )  # fmt: skip
+
+
+def _table(first: str, rows: dict[str, Row]) -> list[str]:
+    columns = list(next(iter(rows.values()), {}))
+    lines = [f"| {key} | {' | '.join(row[c] for c in columns)} |" for key, row in rows.items()]
+    return [f"| {first} | {' | '.join(columns)} |", "|---" * (len(columns) + 1) + "|", *lines, ""]
 
 
 if __name__ == "__main__":
