@@ -13,7 +13,15 @@ from factorsfm.cli import main
 from factorsfm.converge import _everywhere
 from factorsfm.errors import InputError
 from factorsfm.factors import distort
-from factorsfm.lens import Lens, lens_covariances, renormalized, solved_with_lens, through, undistort
+from factorsfm.lens import (
+    Lens,
+    _solved_as_it_moves,
+    lens_covariances,
+    renormalized,
+    solved_with_lens,
+    through,
+    undistort,
+)
 from factorsfm.noise import image_cells
 from factorsfm.options import FOCAL_STD, Options, PolishOptions
 from factorsfm.polish import polish
@@ -24,7 +32,7 @@ from factorsfm.refinement import BundleAdjustment
 BARREL = np.array([-0.15, 0.02, 0.0, 0.0])
 
 
-def estimated(problem, *, guess=1.3, shape=None, lens="distortion"):
+def estimated(problem, *, guess=1.3, shape=None, lens="distortion", first_std=None):
     """The polish of a problem whose lens has a shape, from tracks that a guess normalised without it."""
     truth = Lens(np.array([problem.focal]), np.zeros(4))
     seen = replace(
@@ -35,7 +43,8 @@ def estimated(problem, *, guess=1.3, shape=None, lens="distortion"):
     images = mapped_images(replace(problem, observations=renormalized(seen, truth, wrong, start.group)), start)
     points = np.arange(len(start.bearing)), start.points
     options = replace(Options.preset_named("geometry"), lens=lens)
-    return polish(images, points, wrong.focal, options)
+    first = None if first_std is None else (wrong.focal, first_std)
+    return polish(images, points, wrong.focal, options, first_focal=first)
 
 
 def assert_derivative(analytic, function, size, step=1e-6):
@@ -204,6 +213,37 @@ def test_tiny_motion_or_none_but_along_the_view_axis_keeps_the_guess(motion, par
     assert not result.lens.determined
     assert np.exp(result.state.log_focal) == pytest.approx(1.2 * problem.focal)
     assert result.lens.focal_std > FOCAL_STD
+
+
+@pytest.mark.parametrize("first_std", [0.04, 0.08, 0.3])
+def test_a_focal_length_that_is_not_determined_is_the_mean_of_guess_and_estimate(first_std):
+    problem = make_problem("arc", frames=8, points=150, parallax=0.1, noise_px=0.15, seed=3)
+    alone = estimated(problem, guess=1.2, lens="focal", first_std=10.0).lens
+    assert alone.rough
+    assert not alone.determined
+    assert FOCAL_STD < alone.focal_std < 0.2
+    found = np.log(alone.lens.focal[0] / problem.focal)
+    result = estimated(problem, guess=1.2, lens="focal", first_std=first_std)
+    assert result.lens.rough == (alone.focal_std < first_std)
+    weights = np.array([alone.focal_std[0], first_std]) ** -2.0 if result.lens.rough else np.array([0.0, 1.0])
+    expected = weights @ [found, np.log(1.2)] / weights.sum()
+    assert np.log(np.exp(result.state.log_focal) / problem.focal) == pytest.approx(expected, abs=2e-3)
+    assert result.sigma < 0.25
+
+
+@pytest.mark.parametrize(("motion", "parallax"), [("rotation", 0.0), ("arc", 0.3)])
+def test_a_translation_that_is_none_does_not_bend_with_the_lens(motion, parallax):
+    problem = make_problem(motion, frames=8, points=150, parallax=parallax, noise_px=0.05)
+    seen = replace(problem.observations, xy=distort(problem.observations.xy, BARREL)[0])
+    bent = replace(problem.truth, translation=problem.truth.translation + 0.01 * np.eye(8, 3))
+    solved, moves = _solved_as_it_moves(
+        replace(bent, translation=bent.translation - bent.translation[0]), seen, PolishOptions(tolerance=1e-5), 0.05,
+        np.array([0.1, 0.1, 0.0, 0.0]), None,
+    )  # fmt: skip
+    assert moves == (motion == "arc")
+    assert solved.state.translation.any() == moves
+    np.testing.assert_allclose(solved.state.lens, BARREL, atol=0.02)
+    assert np.exp(solved.state.log_focal) == pytest.approx(problem.focal, rel=0.01)
 
 
 def test_tracks_that_fit_no_lens_determine_none():
