@@ -23,13 +23,14 @@ from numpy.typing import NDArray
 
 import factorsfm
 from benchmarks.inputs import NETWORK_FILES
-from factorsfm.camera import normalized_from_pixels, pixels_from_normalized, with_lens
+from factorsfm.camera import normalized_from_pixels, pixels_from_normalized, with_focal, with_lens
 from factorsfm.evaluation.metrics import auc, relative_pose_errors
 from factorsfm.evaluation.readers import read_shot
 from factorsfm.evaluation.truth import Shot
 
 _SEVEN, _TWO = ("d01", "d03", "d04", "d05", "d07", "d08", "d10"), ("d04", "d07")
 DISTORTIONS = {(-0.15, 0.02): _SEVEN, (-0.3, 0.08): _TWO, (0.08, 0.0): _TWO}  # k1, k2, and shots
+_HELD = " focal length given"
 _LONGER = 1.005
 _SCALES = np.linspace(0.95, 1.05, 401)
 _RESULTS = Path(__file__).parent / "results"
@@ -95,6 +96,7 @@ def main() -> None:
     parser.add_argument("--models", type=Path, required=True)
     parser.add_argument("--shots", nargs="*", default=[f"d{k:02d}" for k in range(1, 11)], help="beginnings of names")
     parser.add_argument("--distorted", nargs="*", default=_SEVEN, help="the same, of those to see through other lenses")
+    parser.add_argument("--held", action="store_true", help="the latter with their focal length given")
     arguments = parser.parse_args()
     depth = factorsfm.DepthModel(arguments.models / NETWORK_FILES["tcmonodepth"])
     folders = sorted(arguments.data.glob("*/*"))
@@ -103,7 +105,7 @@ def main() -> None:
     def keep(key: str, row: Row) -> None:
         rows[key] = row
         print(key, row, flush=True)
-        ROWS.write_text(json.dumps(dict(sorted(rows.items())), indent=1) + "\n")
+        ROWS.write_text(json.dumps(rows, indent=1) + "\n")
         RESULT.write_text(report(rows))
 
     for folder in folders:
@@ -112,7 +114,8 @@ def main() -> None:
     for (k1, k2), names in DISTORTIONS.items():
         for folder in folders:
             if folder.name.startswith(names) and folder.name.startswith(tuple(arguments.distorted)):
-                keep(f"{folder.name} {k1} {k2}", distorted_row(read_shot(folder), depth, k1, k2))
+                key = f"{folder.name} {k1} {k2}{_HELD * arguments.held}"
+                keep(key, distorted_row(read_shot(folder), depth, k1, k2, held=arguments.held))
 
 
 def shot_row(shot: Shot, depth: factorsfm.DepthModel) -> Row:
@@ -127,10 +130,13 @@ def shot_row(shot: Shot, depth: factorsfm.DepthModel) -> Row:
     }  # fmt: skip
 
 
-def distorted_row(shot: Shot, depth: factorsfm.DepthModel, k1: float, k2: float) -> Row:
-    """The shot as a lens with this distortion would have seen it, without its lens."""
+def distorted_row(shot: Shot, depth: factorsfm.DepthModel, k1: float, k2: float, *, held: bool) -> Row:
+    """The shot as a lens with this distortion would have seen it, without its lens, or with its focal length alone."""
     truth = true_lens(shot, k1, k2)
-    result = factorsfm.reconstruct(distorted_frames(shot, truth), depth=depth)
+    camera = with_focal(shot.camera, truth.mean_focal_length()) if held else None
+    result = factorsfm.reconstruct(
+        distorted_frames(shot, truth), camera=camera, depth=depth, lens="radial" if held else "auto"
+    )
     found, off = result.camera, difference_px(result.camera, truth)
     k = found.params[3:] if found.model_name == "RADIAL" else (0.0, 0.0)
     return _found(result, shot, truth) | {
@@ -154,8 +160,10 @@ def _found(result: factorsfm.Reconstruction, shot: Shot, truth: pycolmap.Camera)
 
 def report(rows: dict[str, Row]) -> str:
     """The tables, as Markdown."""
+    rows = dict(sorted(rows.items()))
     plain = {key: row for key, row in rows.items() if " " not in key}
-    bent = {key: row for key, row in rows.items() if " " in key}
+    bent = {key: row for key, row in rows.items() if " " in key and not key.endswith(_HELD)}
+    held = {key.removesuffix(_HELD): row for key, row in rows.items() if key.endswith(_HELD)}
     return "\n".join(
         [
             "# Unknown lenses", "",
@@ -168,6 +176,8 @@ def report(rows: dict[str, Row]) -> str:
             "the image; at its own focal length: the median of what is left when the error of the focal length is "
             "taken out.", "",
             *_table("shot, k1, k2", bent),
+            "The same with the focal length given (`--lens radial`):", "",
+            *_table("shot, k1, k2", held),
         ]
     )  # fmt: skip
 

@@ -346,8 +346,8 @@ def _add_shot_arguments(parser: argparse.ArgumentParser, output: str = _RESULT) 
         choices=get_args(LensFreedom),
         default="auto",
         help="what of the lens is estimated where the shot determines it: nothing, the focal length, also the radial "
-        "distortion, or also the principal point; zoom: distortion, and a focal length for every frame; auto: fixed "
-        "with --camera, distortion without",
+        "distortion, or also the principal point; radial: the distortion alone; zoom: distortion, and a focal length "
+        "for every frame; auto: fixed with --camera, distortion without",
     )
     parser.add_argument("--preset", choices=list(PRESETS), default="default", help="default: %(default)s")
 

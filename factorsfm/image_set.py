@@ -261,7 +261,7 @@ class ImageSet:
                     np.array([part.focal]),
                     options,
                     lambda stage: progress(stage, 0, None),
-                    lens_shape(camera) if options.refine_focal_length else None,
+                    lens_shape(camera) if options.estimates_lens else None,
                     control=control and _scaled(control, camera.mean_focal_length() / part.focal),
                 )
             except ReconstructionError as error:

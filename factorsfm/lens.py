@@ -28,6 +28,7 @@ _TOLERANCE = 1e-5  # the focal length lies along a flat valley
 _OPEN_FOCAL_STD = 0.02  # like `FOCAL_STD`, with what a distortion that is not believed leaves open
 _DISTORTION_SIGMA = 0.1
 _CENTER_SIGMA = 0.02  # of the width
+_HELD_STD = 1e-6  # relative, of a focal length that is known
 _LARGEST_RATIO = 4.0  # of the focal length to its guess
 _MISFIT = 1.5  # of the standard deviation above which a solution is doubted
 _CELLS = (6, 4)  # across and down, in which the errors of tracks may be alike
@@ -51,7 +52,7 @@ class LensEstimate:
 
     Attributes:
         guess: with which the tracks were undistorted; lens: what the shot says, or the guess.
-        focal_std: (g,) relative standard deviations of the estimated focal lengths, believed or not.
+        focal_std: (g,) relative standard deviations of the estimated focal lengths, believed or not; 0 of known ones.
         shape_std: (4,) standard deviations of the shape, NaN where it stays as guessed.
         misfit_px: standard deviation of the tracks where they fit no lens: what an estimate says is chance then;
             0 where they do.
@@ -124,13 +125,17 @@ def estimate_lens(
     """
     o = replace(options.polish, tolerance=_TOLERANCE)
     groups, width = len(guess.focal), float(np.ptp(adjustment.observations.xy, axis=0).max())
+    held = not options.refine_focal_length
     sigmas = {
         "focal": np.zeros(4),
         "distortion": np.array([_DISTORTION_SIGMA, _DISTORTION_SIGMA, 0.0, 0.0]),
         "all": np.array([_DISTORTION_SIGMA, _DISTORTION_SIGMA, _CENTER_SIGMA * width, _CENTER_SIGMA * width]),
-    }["distortion" if options.lens == "zoom" else options.lens]
+    }["distortion" if held or options.lens == "zoom" else options.lens]
     group = adjustment.state.group
-    focal = search_focal(adjustment, guess, o)
+    if held:
+        focal, focal_prior = guess.focal, (np.log(guess.focal), np.eye(groups) / _HELD_STD**2)
+    else:
+        focal = search_focal(adjustment, guess, o)
     start = replace(through(adjustment.state, focal), lens=guess.shape)
     observations = renormalized(adjustment.observations, guess, Lens(focal, guess.shape), group)
     best, moves = _solved_as_it_moves(start, observations, o, adjustment.sigma, np.zeros(4), focal_prior)
@@ -155,6 +160,7 @@ def estimate_lens(
             known &= float(np.hypot(full_std[:groups], moved).max()) < _OPEN_FOCAL_STD
             std[:groups] = np.fmax(std[:groups], np.hypot(full_std[:groups], moved))
     lens, focal_std, shape_std = Lens(np.exp(best.state.log_focal), best.state.lens), std[:groups], std[groups:]
+    focal_std = np.zeros(groups) if held else focal_std
     logger.info("focal length %s pixels within %s %%, guess %s", lens.focal, 100 * focal_std, guess.focal)
     misfit = best.sigma if best.sigma > _MISFIT * o.doubtful_px else 0.0
     far = np.abs(np.log(lens.focal / guess.focal)).max() > np.log(_LARGEST_RATIO)

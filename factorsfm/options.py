@@ -12,7 +12,7 @@ FOCAL_STD = 0.015  # relative standard deviation up to which a focal length coun
 GUESSED_FOCAL_STD = 0.3  # of a focal length that nothing tells: fields of view of 30 to 75 degrees
 TOLD_FOCAL_STD = 0.05  # of one from EXIF data or a camera file that is to be refined
 
-LensFreedom = Literal["auto", "fixed", "focal", "distortion", "all", "zoom"]
+LensFreedom = Literal["auto", "fixed", "focal", "radial", "distortion", "all", "zoom"]
 DepthUse = Literal["none", "paper", "inverse"]
 
 
@@ -123,9 +123,9 @@ class Options:
     Attributes:
         preset: name from which the options were made.
         lens: what the polish estimates where the shot determines it: nothing, the focal length, also the radial
-            distortion, or also the principal point; "zoom" is "distortion" with a focal length for every frame, where
-            the shot shows that it changes; "auto" is "fixed" for a given camera and "distortion" for none, "all" in an
-            image set with much parallax.
+            distortion, or also the principal point; "radial" is the distortion alone; "zoom" is "distortion" with a
+            focal length for every frame, where the shot shows that it changes; "auto" is "fixed" for a given camera and
+            "distortion" for none, "all" in an image set with much parallax.
     """
 
     preset: str = "default"
@@ -163,9 +163,14 @@ class Options:
             raise InputError(f"these are not the options of this version: {error}") from error
 
     @property
-    def refine_focal_length(self) -> bool:
-        """Whether the lens is an unknown of the polish."""
+    def estimates_lens(self) -> bool:
+        """Whether anything of the lens is an unknown of the polish."""
         return self.lens not in ("auto", "fixed")
+
+    @property
+    def refine_focal_length(self) -> bool:
+        """Whether the focal length is unknown, in the map as in the polish."""
+        return self.estimates_lens and self.lens != "radial"
 
     def for_unknown_lens(self) -> Options:
         """What "auto" means without a camera."""

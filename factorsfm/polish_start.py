@@ -70,12 +70,12 @@ def polish_start(
     """
     o = options.polish
     progress("polish: cameras")
-    core = core_tracks(observations, len(images), everywhere=options.refine_focal_length)
+    core = core_tracks(observations, len(images), everywhere=options.estimates_lens)
     few = observations.of(core)
     start = _first_guess(images, few, tracks[core], map_points, guess.focal, group, _world(observations))
     kept, adjustment = converge_cameras(start, few, options)
     core, few, lens = core[kept], adjustment.observations, None
-    if options.refine_focal_length:
+    if options.estimates_lens:
         adjustment, lens = _estimate_lens(adjustment, guess, frames, options, first_focal)
         few = adjustment.observations
         observations = lens.renormalize(observations, adjustment.state.group)

@@ -87,7 +87,8 @@ class LensFit:
     Attributes:
         determined: whether the shot says what the focal length is; otherwise it is the guess, or the mean of the guess
             and what the shot says, each weighed as well as it is known.
-        focal_std: standard deviation of the focal length, relative; of a zoom the largest one; None for the guess.
+        focal_std: standard deviation of the focal length, relative; of a zoom the largest one; None for the guess,
+            and for a focal length that was held.
         k1_std, k2_std: of the radial distortion.
         cx_std, cy_std: of the principal point, in focal lengths.
         zoom_std: of the ratio of the longest to the shortest focal length, relative, where a zoom was looked for. The

@@ -244,7 +244,7 @@ def _notes(polished: Polished, has_depth: bool) -> list[str]:
 
 def _lens_note(estimate: LensEstimate) -> str:
     focals, std = estimate.lens.focal, f"standard deviation {100 * estimate.focal_std.max():.1f} %"
-    focal, zoom = float(np.median(focals)), ""
+    focal, zoom, held = float(np.median(focals)), "", not estimate.focal_std.any()
     if estimate.zoom_std is not None and len(focals) == 1:
         zoom = f" No zoom was found: what it might be is less than {200 * estimate.zoom_std:.1f} %."
     elif estimate.zoom_std is not None:
@@ -258,15 +258,20 @@ def _lens_note(estimate: LensEstimate) -> str:
         reason = f"this shot does not determine it ({std})"
         if estimate.misfit_px:
             reason = f"the tracks fit no lens (typical error {estimate.misfit_px:.2f} pixels)"
-        return f"The focal length is a guess ({focal:.0f} pixels): {reason}.{zoom}"
-    note = f"The focal length was estimated: {focal:.0f} pixels, {std}"
+        kept = "as it was given" if held else f"a guess ({focal:.0f} pixels)"
+        return f"The focal length is {kept}: {reason}.{zoom}"
+    note = (
+        "The focal length is as it was given" if held else f"The focal length was estimated: {focal:.0f} pixels, {std}"
+    )
     if np.isfinite(estimate.shape_std[0]):
         k, k_std = estimate.lens.shape, estimate.shape_std
         note += f"; radial distortion k1 {k[0]:.3f} ± {k_std[0]:.3f}, k2 {k[1]:.3f} ± {k_std[1]:.3f}"
+    elif held:
+        note += "; no distortion was found"
     return f"{note}.{zoom}"
 
 
 def _lens_fit(estimate: LensEstimate) -> LensFit:
     k1, k2, x, y = (float(std) if np.isfinite(std) else None for std in estimate.shape_std)
-    focal_std = float(estimate.focal_std.max()) if estimate.determined or estimate.rough else None
-    return LensFit(estimate.determined, focal_std, k1, k2, x, y, estimate.zoom_std)
+    focal_std = float(estimate.focal_std.max()) if estimate.determined or estimate.rough else 0.0
+    return LensFit(estimate.determined, focal_std or None, k1, k2, x, y, estimate.zoom_std)

@@ -278,7 +278,7 @@ class Stream(Closing):
                 np.array([mapper.focal]),
                 self.options,
                 lambda stage: progress(stage, 0, None) if progress else None,
-                lens_shape(self.camera) if self.options.refine_focal_length else None,
+                lens_shape(self.camera) if self.options.estimates_lens else None,
                 control=control,
                 first_focal=(np.array([mapper.first_focal]), self._first_focal_std),
             )
@@ -365,7 +365,7 @@ class Stream(Closing):
             self.camera = guess_camera(width, height, frame.path)
             self.options = self.options.for_unknown_lens()
         check_camera(self.camera, width, height)
-        if self.options.refine_focal_length:
+        if self.options.estimates_lens:
             lens_shape(self.camera)  # refuses what cannot be estimated
         self._size = (width, height)
         self._mapper = self._new_mapper()

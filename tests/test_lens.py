@@ -28,6 +28,7 @@ from factorsfm.polish import polish
 from factorsfm.problem import Observations
 from factorsfm.reconstruction import ShotKind
 from factorsfm.refinement import BundleAdjustment
+from factorsfm.result import _lens_note
 
 BARREL = np.array([-0.15, 0.02, 0.0, 0.0])
 
@@ -265,6 +266,22 @@ def test_distortion_is_recovered_over_the_image(lens):
     truth = problem.focal * distort(xy, shape)[0]
     off = np.linalg.norm(found.lens.focal * distort(xy, found.lens.shape)[0] - truth, axis=1)
     assert 1e-4 < np.percentile(off, 99) < (0.5 if lens == "distortion" else 1.5)
+
+
+def test_distortion_alone_is_recovered_and_the_focal_length_stays_as_given():
+    problem = make_problem("truck", frames=8, points=250, parallax=0.05, noise_px=0.03)
+    result = estimated(problem, guess=1.0, shape=BARREL, lens="radial")
+    found = result.lens
+    assert found.determined
+    assert not found.focal_std.any()
+    assert found.lens.focal == pytest.approx(problem.focal, rel=1e-6)
+    assert _lens_note(found).startswith("The focal length is as it was given; radial distortion k1 -0.1")
+    xy = problem.observations.xy
+    off = problem.focal * np.linalg.norm(distort(xy, found.lens.shape)[0] - distort(xy, BARREL)[0], axis=1)
+    assert 1e-4 < np.percentile(off, 99) < 0.3
+    straight = estimated(problem, guess=1.0, lens="radial").lens
+    assert _lens_note(straight) == "The focal length is as it was given; no distortion was found."
+    assert not straight.lens.shape.any()
 
 
 def test_a_camera_of_the_lens_sees_as_the_lens_does():
