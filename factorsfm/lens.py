@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from factorsfm.factors import distort
 from factorsfm.noise import block_inflation, coordinate_sigma, image_cells
 from factorsfm.observability import classify_motion
-from factorsfm.options import FOCAL_STD, Options, PolishOptions
+from factorsfm.options import FOCAL_STD, TOLD_FOCAL_STD, Options, PolishOptions
 from factorsfm.problem import Observations, State
 from factorsfm.reconstruction import ShotKind
 from factorsfm.refinement import BundleAdjustment
@@ -189,11 +189,12 @@ def estimate_lens(
 def _kept_focal(found: Array, std: Array, first: tuple[Array, float], *, counts: bool) -> tuple[Array, bool]:
     """Focal lengths that the shot does not determine, (g,), and whether it has a say in them.
 
-    Where it knows them better than they were known at first, they are the means of the logarithms of both, each weighed
-    by its variance; else those of before.
+    Where it knows them better than they were known at first, and as well as EXIF data would, they are the means of the
+    logarithms of both, each weighed by its variance; else those of before: in a long valley a standard deviation says
+    little.
     """
     focal, first_std = first
-    if not counts or float(std.max()) >= first_std:
+    if not counts or float(std.max()) >= min(first_std, TOLD_FOCAL_STD):
         return focal, False
     share = first_std**2 / (first_std**2 + std**2)
     return np.asarray(found**share * focal ** (1.0 - share)), True
