@@ -128,7 +128,10 @@ def controlled(adjustment: BundleAdjustment, located: LocatedControl, frames: li
     state, term, held = _start(known, adjustment.state, placed)
     options = replace(adjustment.options, point_sigma=_POINT_SIGMA, iterations=_STEPS, tolerance=_TOLERANCE)
     if known.held:
-        moved = BundleAdjustment(state, adjustment.observations, options, sigma=adjustment.sigma, points_only=True)
+        moved = BundleAdjustment(
+            state, adjustment.observations, options,
+            sigma=adjustment.sigma, points_only=True, track_errors=adjustment.track_errors,
+        )  # fmt: skip
         state = moved.solve(_POINT_STEPS)
     sizes = [float(np.linalg.norm(r)) for r in term.residuals(state)]
     typical = float(np.median(sizes)) if sizes else 0.0
@@ -140,6 +143,7 @@ def controlled(adjustment: BundleAdjustment, located: LocatedControl, frames: li
         solved = BundleAdjustment(
             state, adjustment.observations, options,
             sigma=adjustment.sigma, fixed=held, prior=adjustment.prior, control=term,
+            track_errors=adjustment.track_errors,
         )  # fmt: skip
         state = solved.solve()
         logger.debug("control: kernel %.1f sigma, %d iterations", kernel, solved.iterations)

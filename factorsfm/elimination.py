@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.track_errors import STRETCH, TrackErrors
+
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
@@ -24,6 +26,7 @@ class Term:
     Attributes:
         residual: (d, m); by_camera: (c, d, m); by_point: (3, d, m).
         columns: (m, c) camera-side variables of `by_camera`; frame, point: (m,).
+        errors: how the residuals repeat each other; they are decorrelated then, the derivatives are not. None: not.
     """
 
     residual: Array
@@ -32,6 +35,11 @@ class Term:
     by_point: Array
     frame: Index
     point: Index
+    errors: TrackErrors | None = None
+
+    @property
+    def decorrelated_by_point(self) -> Array:
+        return self.by_point if self.errors is None else self.errors.decorrelated(self.by_point)
 
 
 @dataclass(slots=True)
@@ -73,15 +81,37 @@ class Elimination:
                 dense = dense.reshape(len(columns), -1)
                 camera[np.ix_(columns, columns)] += dense @ dense.T
                 gradient[columns] += dense @ t.residual[:, rows].ravel()
+            if t.errors is not None:
+                self._take_away_repeated(camera, t, t.errors, groups)
+            by_point = t.decorrelated_by_point
             seen, first = np.unique(t.point, return_index=True)
             for i in range(3):
                 point_gradient[seen, i] += np.add.reduceat((t.by_point[i] * t.residual).sum(0), first)
                 for j in range(i, 3):
-                    sums = np.add.reduceat((t.by_point[i] * t.by_point[j]).sum(0), first)
+                    sums = np.add.reduceat((t.by_point[i] * by_point[j]).sum(0), first)
                     point[seen, i, j] += sums
                     if j > i:
                         point[seen, j, i] += sums
         return Normal(camera, gradient, point, point_gradient, terms)
+
+    def _take_away_repeated(
+        self, camera: Array, t: Term, errors: TrackErrors, groups: list[tuple[Index, Index, Index]]
+    ) -> None:
+        """From the information of the cameras, what residuals of a stretch say again and again."""
+        frames = np.array([t.frame[rows[0]] for rows, _, _ in groups])
+        scale = errors.root_weight * np.sqrt(errors.shared)[errors.stretch]
+        for window in np.unique(frames // STRETCH):
+            mine = [groups[k] for k in np.nonzero(frames // STRETCH == window)[0]]
+            occurring, _ = self._occurring(*(columns for _, columns, _ in mine))
+            seen = np.unique(errors.stretch[np.concatenate([rows for rows, _, _ in mine])])
+            total = np.zeros((len(occurring), len(t.residual), len(seen)))
+            for rows, columns, local in mine:
+                at = np.searchsorted(occurring, columns)[local.T if len(local) > 1 else local.T.repeat(len(rows), 1)]
+                place = np.searchsorted(seen, errors.stretch[rows])
+                for d in range(total.shape[1]):
+                    total[at, d, place] += t.by_camera[:, d, rows] * scale[rows]
+            flat = total.reshape(len(occurring), -1)
+            camera[np.ix_(occurring, occurring)] -= flat @ flat.T
 
     def _frame_groups(self, terms: list[Term]) -> list[list[tuple[Index, Index, Index]]]:
         """For every term and frame: its rows, their columns, and the position of each entry among the columns.
@@ -127,12 +157,13 @@ class Elimination:
     def cross_blocks(self, normal: Normal) -> list[Block]:
         """Camera-point blocks of the information matrix, dense over the columns of each chunk."""
         blocks = []
+        by_points = [t.decorrelated_by_point for t in normal.terms]
         for flat, columns, span in self._chunk_indices(normal.terms):
             n = span.stop - span.start
             cross = np.zeros(len(columns) * 3 * n)
-            for t, position in zip(normal.terms, flat, strict=True):
+            for t, by_point, position in zip(normal.terms, by_points, flat, strict=True):
                 rows = slice(*np.searchsorted(t.point, [span.start, span.stop]))
-                a, b = t.by_camera[:, :, rows], t.by_point[:, :, rows]
+                a, b = t.by_camera[:, :, rows], by_point[:, :, rows]
                 values = sum(a[:, None, d] * b[None, :, d] for d in range(a.shape[1]))
                 cross += np.bincount(position, np.ravel(values), len(cross))
             blocks.append((cross.reshape(len(columns), 3 * n), columns, span))

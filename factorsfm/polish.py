@@ -17,20 +17,23 @@ from factorsfm.images import MappedImage, gather, seen_by
 from factorsfm.joined import joined_frames
 from factorsfm.lens import Lens, LensEstimate
 from factorsfm.marginals import in_scene_unit
-from factorsfm.noise import SMALLEST_SIGMA_PX
+from factorsfm.noise import SMALLEST_SIGMA_PX, block_inflation
 from factorsfm.observability import Motion, camera_observability, pose_blocks
-from factorsfm.options import Options
+from factorsfm.options import Options, PolishOptions
 from factorsfm.polish_start import polish_start
 from factorsfm.prior_term import PriorPart, joint_problem
 from factorsfm.problem import Observations, State
 from factorsfm.reconstruction import CameraObservability, ControlFit, ShotKind
 from factorsfm.refinement import BundleAdjustment
 from factorsfm.registration import register_image
+from factorsfm.track_errors import TrackErrors, measure_track_errors
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 logger = logging.getLogger(__name__)
+
+_ROUNDS, _ITERS = 2, 2
 
 
 @dataclass(slots=True)
@@ -135,14 +138,22 @@ def polish(
 
     progress("polish: all tracks")
     prior = None
+    scale, wide, errors = sigma, float(np.sqrt(known.inflation)), None
+    if o.observation_sigmas is None:
+        state, errors = _with_track_errors(state, observations, sigma, free, o)
+        residual = BundleAdjustment(state, observations, o, sigma=1.0).reprojection_vectors()
+        scale, wide = errors.sigma, float(np.sqrt(block_inflation(errors.whitened(residual), observations)))
     # Pixel errors that repeat themselves, from frame to frame and among neighbours, weigh less; the kernel keeps its
     # width in pixels.
-    wide = float(np.sqrt(known.inflation))
     final = replace(o, kernel=o.kernel / wide)
     if known.prior is not None:
-        adjustment, prior = joint_problem(state, observations, tracks, used, known.prior, sigma * wide, final)
+        adjustment, prior = joint_problem(
+            state, observations, tracks, used, known.prior, scale * wide, final, track_errors=errors
+        )
     else:
-        adjustment = BundleAdjustment(state, observations, final, sigma=sigma * wide, free_translation=free)
+        adjustment = BundleAdjustment(
+            state, observations, final, sigma=scale * wide, free_translation=free, track_errors=errors
+        )
     adjustment.solve(o.final_iterations)
     if prior is not None:
         prior.residual = adjustment.prior_residuals()
@@ -172,6 +183,22 @@ def polish(
             result.state, result.lens = replace(result.state, log_focal=np.log(lens.lens.focal), group=solved), lens
         _add_frames_between(result, images, registered, group, options)
     return result
+
+
+def _with_track_errors(
+    state: State, observations: Observations, sigma: float, free: bool, options: PolishOptions
+) -> tuple[State, TrackErrors]:
+    """The tracks without the prior, and how far their errors persist, which shows where the cameras fit them all."""
+    adjustment = BundleAdjustment(state, observations, options, sigma=sigma, free_translation=free)
+    for rounds in range(_ROUNDS):
+        residual = adjustment.reprojection_vectors()
+        errors = measure_track_errors(residual, observations, options.kernel)
+        adjustment = BundleAdjustment(
+            adjustment.state, observations, options, sigma=errors.sigma, free_translation=free, track_errors=errors
+        )
+        if rounds < _ROUNDS - 1:
+            adjustment.solve(_ITERS)
+    return adjustment.state, errors
 
 
 def _unheld(observations: Observations, frames: list[int], least: int) -> dict[int, str]:

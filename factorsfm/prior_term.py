@@ -21,6 +21,7 @@ from factorsfm.prior_weight import (
 from factorsfm.problem import Observations, PriorObservations, State
 from factorsfm.refinement import BundleAdjustment
 from factorsfm.registration import KNOWN_SHIFT_SIGMA, SCALE_SIGMA, SHIFT_SIGMA, fit_affine
+from factorsfm.track_errors import TrackErrors
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -113,8 +114,9 @@ def joint_problem(
     sigma: float,
     options: PolishOptions,
     fixed: NDArray[np.bool_] | None = None,
+    track_errors: TrackErrors | None = None,
 ) -> tuple[BundleAdjustment, PriorPart]:
-    """Tracks and the prior at its weight; `fixed` as in `BundleAdjustment`."""
+    """Tracks and the prior at its weight; `fixed` and `track_errors` as in `BundleAdjustment`."""
     values = _prior_values(images, observations, tracks, weighed.rows)
     assert values is not None
     first_scale, first_shift = (
@@ -130,7 +132,7 @@ def joint_problem(
         SHIFT_SIGMA if values.free_shift else KNOWN_SHIFT_SIGMA,
     )  # fmt: skip
     state = replace(state, scale=first_scale, shift=first_shift, field=np.zeros(len(information)))
-    joint = BundleAdjustment(state, observations, options, sigma=sigma, fixed=fixed, prior=prior)
+    joint = BundleAdjustment(state, observations, options, sigma=sigma, fixed=fixed, prior=prior, track_errors=track_errors)
     none = np.zeros(0)
     return joint, PriorPart(weighed.weight, values.rows, prior, none, none, none)
 

@@ -19,6 +19,7 @@ from factorsfm.factors import affine_inverse_depth, by_pose, cauchy, cross_matri
 from factorsfm.marginals import Marginals, tangent_basis
 from factorsfm.options import PolishOptions
 from factorsfm.problem import Observations, PriorObservations, State
+from factorsfm.track_errors import TrackErrors
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -51,6 +52,8 @@ class BundleAdjustment:
             held as well.
         prior: depth-prior values, or None.
         control: what is known beforehand of poses and points, or None.
+        track_errors: weights of the observations, and how far their errors repeat each other; the kernel then works on
+            the prior alone. None: independent errors with the kernel of the options.
     """
 
     def __init__(
@@ -68,6 +71,7 @@ class BundleAdjustment:
         fixed: NDArray[np.bool_] | None = None,
         prior: PriorObservations | None = None,
         control: ControlTerm | None = None,
+        track_errors: TrackErrors | None = None,
     ) -> None:
         if (np.diff(observations.point) < 0).any():
             raise ValueError("observations must be sorted by point")
@@ -77,6 +81,7 @@ class BundleAdjustment:
         self.sigma = sigma
         self.prior = prior
         self.control = control
+        self.track_errors = track_errors
         self.iterations = 0
         self._anchor = state.inverse_distance.copy()
         self._focal_prior = focal_prior
@@ -173,7 +178,11 @@ class BundleAdjustment:
         return (residual + scale * smooth) / p.sigma, by_z / p.sigma, by_w / p.sigma, q, w / q[:, 2] + smooth
 
     def _cost(self, state: State) -> float:
-        cost = cauchy(self._reprojection(state)[0], self.options.kernel)[0].sum()
+        residual = self._reprojection(state)[0]
+        if self.track_errors is None:
+            cost = cauchy(residual, self.options.kernel)[0].sum()
+        else:
+            cost = self.track_errors.cost(residual)
         cost += 0.5 * (((state.inverse_distance - self._anchor) / self._point_sigma) ** 2).sum()
         difference, information = self._lens_prior(state)
         cost += 0.5 * (information * difference**2).sum()
@@ -199,7 +208,8 @@ class BundleAdjustment:
         s, o = self.state, self.observations
         tangent = tangent_basis(s.bearing)
         residual, by_q, q = self._reprojection(s)
-        weight = np.sqrt(cauchy(residual, self.options.kernel)[1])
+        errors = self.track_errors
+        weight = np.sqrt(cauchy(residual, self.options.kernel)[1]) if errors is None else errors.root_weight
         gain = np.ascontiguousarray((by_q * weight[:, None, None]).transpose(1, 0, 2))
         by_lens = (self._by_lens(residual, q) * weight[:, None, None]).transpose(1, 0, 2)
         by_camera = np.concatenate([by_pose(gain, q, s.inverse_distance[o.point]), by_lens], 2)
@@ -209,14 +219,16 @@ class BundleAdjustment:
         columns = np.concatenate(
             [6 * o.frame[:, None] + np.arange(6), self._lens + self._group[:, None], shape], 1
         )  # fmt: skip
+        weighted = (residual * weight[:, None]).T
         terms = [
             Term(
-                (residual * weight[:, None]).T,
+                weighted if errors is None else errors.decorrelated(weighted),
                 np.ascontiguousarray(by_camera.transpose(2, 0, 1)),
                 columns,
                 np.ascontiguousarray(by_point.transpose(2, 1, 0)),
                 o.frame,
                 o.point,
+                errors,
             )
         ]
         if (p := self.prior) is not None:
