@@ -33,7 +33,7 @@ Index = NDArray[np.int64]
 
 logger = logging.getLogger(__name__)
 
-_ROUNDS, _ITERS = 2, 2
+_FIRST_ITERATIONS = 2  # over all tracks, until their errors are measured
 
 
 @dataclass(slots=True)
@@ -190,15 +190,8 @@ def _with_track_errors(
 ) -> tuple[State, TrackErrors]:
     """The tracks without the prior, and how far their errors persist, which shows where the cameras fit them all."""
     adjustment = BundleAdjustment(state, observations, options, sigma=sigma, free_translation=free)
-    for rounds in range(_ROUNDS):
-        residual = adjustment.reprojection_vectors()
-        errors = measure_track_errors(residual, observations, options.kernel)
-        adjustment = BundleAdjustment(
-            adjustment.state, observations, options, sigma=errors.sigma, free_translation=free, track_errors=errors
-        )
-        if rounds < _ROUNDS - 1:
-            adjustment.solve(_ITERS)
-    return adjustment.state, errors
+    adjustment.solve(_FIRST_ITERATIONS)
+    return adjustment.state, measure_track_errors(adjustment.reprojection_vectors(), observations, options.kernel)
 
 
 def _unheld(observations: Observations, frames: list[int], least: int) -> dict[int, str]:

@@ -132,7 +132,9 @@ def joint_problem(
         SHIFT_SIGMA if values.free_shift else KNOWN_SHIFT_SIGMA,
     )  # fmt: skip
     state = replace(state, scale=first_scale, shift=first_shift, field=np.zeros(len(information)))
-    joint = BundleAdjustment(state, observations, options, sigma=sigma, fixed=fixed, prior=prior, track_errors=track_errors)
+    joint = BundleAdjustment(
+        state, observations, options, sigma=sigma, fixed=fixed, prior=prior, track_errors=track_errors
+    )
     none = np.zeros(0)
     return joint, PriorPart(weighed.weight, values.rows, prior, none, none, none)
 

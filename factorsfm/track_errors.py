@@ -73,7 +73,7 @@ def measure_track_errors(residual: Array, observations: Observations, kernel: fl
 
     Args:
         residual: (m, 2) predicted minus observed position (pixels); observations: sorted by point and frame.
-        kernel: scale of the Cauchy kernel in standard deviations of a track.
+        kernel: scale of the Cauchy kernel in standard deviations of all errors.
     """
     o, size = observations, np.linalg.norm(residual, axis=1)
     typical = coordinate_sigma(size)
@@ -93,8 +93,7 @@ def measure_track_errors(residual: Array, observations: Observations, kernel: fl
     usual = max(0.0, float(common.sum() / max(pairs.sum(), 1.0)))
     persistent = np.maximum(0.0, (_SHRINKAGE * usual + common) / (_SHRINKAGE + pairs))
 
-    scale = kernel * np.sqrt(sigma**2 + persistent)[o.point]
-    weight = cauchy(residual / scale[:, None], 1.0)[1]
+    weight = cauchy(residual / typical, kernel)[1]
     ratio = persistent[track] / sigma**2
     shared = ratio / (1.0 + ratio * np.add.reduceat(weight, first))
     return TrackErrors(sigma, np.sqrt(weight), first, stretch, shared)
