@@ -65,12 +65,12 @@ class Elimination:
         self._groups: list[list[tuple[Index, Index, Index]]] | None = None
         self._chunks: list[tuple[list[NDArray[np.intp]], Index, slice]] | None = None
 
-    def normal_equations(self, terms: list[Term]) -> Normal:
-        """Information and gradient of the cameras and of each point; each term is sorted by point."""
+    def normal_equations(self, terms: list[Term], *, cameras: bool = True) -> Normal:
+        """Information and gradient of the cameras, if wanted, and of each point; each term is sorted by point."""
         c, n = self._columns, self._points
         camera, gradient = np.zeros((c, c)), np.zeros(c)
         point, point_gradient = np.zeros((n, 3, 3)), np.zeros((n, 3))
-        for t, groups in zip(terms, self._frame_groups(terms), strict=True):
+        for t, groups in zip(terms, self._frame_groups(terms) if cameras else [[]] * len(terms), strict=True):
             for rows, columns, local in groups:
                 entries = t.by_camera[:, :, rows]
                 dense = np.zeros((len(columns), *entries.shape[1:]))
@@ -81,7 +81,7 @@ class Elimination:
                 dense = dense.reshape(len(columns), -1)
                 camera[np.ix_(columns, columns)] += dense @ dense.T
                 gradient[columns] += dense @ t.residual[:, rows].ravel()
-            if t.errors is not None:
+            if t.errors is not None and cameras:
                 self._take_away_repeated(camera, t, t.errors, groups)
             by_point = t.decorrelated_by_point
             seen, first = np.unique(t.point, return_index=True)

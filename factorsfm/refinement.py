@@ -258,7 +258,7 @@ class BundleAdjustment:
 
     def _linearize(self) -> Normal:
         s = self.state
-        normal = self._elimination.normal_equations(self._terms())
+        normal = self._elimination.normal_equations(self._terms(), cameras=len(self._free) > 0)
         camera, gradient, point, point_gradient = (
             normal.camera, normal.camera_gradient, normal.point, normal.point_gradient
         )  # fmt: skip
@@ -300,11 +300,10 @@ class BundleAdjustment:
         free = self._free
         camera = np.zeros(self._columns)
         camera[free] = solve_cameras(self.state, conditioned(information[np.ix_(free, free)]), gradient[free])
-        point = np.empty((len(self.state.bearing), 3))
+        pull = normal.point_gradient.copy()
         for cross, columns, span in blocks:
-            pull = normal.point_gradient[span] + (camera[columns] @ cross).reshape(-1, 3)
-            point[span] = -np.einsum("nij,nj->ni", point_covariance[span], pull)
-        return camera, point
+            pull[span] += (camera[columns] @ cross).reshape(-1, 3)
+        return camera, -np.einsum("nij,nj->ni", point_covariance, pull)
 
     def _retract(self, camera: Array, point: Array) -> State:
         s = self.state
@@ -347,7 +346,7 @@ class BundleAdjustment:
         cost = self.cost()
         for _ in range(iterations or self.options.iterations):
             normal = self._linearize()
-            blocks = self._elimination.cross_blocks(normal)
+            blocks = self._elimination.cross_blocks(normal) if len(self._free) else []
             while damping < _LARGEST_DAMPING:
                 candidate = self._retract(*self._step(normal, blocks, damping, solve_cameras))
                 new_cost = self._cost(candidate)
