@@ -17,7 +17,7 @@ from factorsfm.images import MappedImage, gather, seen_by
 from factorsfm.joined import joined_frames
 from factorsfm.lens import Lens, LensEstimate
 from factorsfm.marginals import in_scene_unit
-from factorsfm.noise import SMALLEST_SIGMA_PX, block_inflation
+from factorsfm.noise import SMALLEST_SIGMA_PX
 from factorsfm.observability import Motion, camera_observability, pose_blocks
 from factorsfm.options import Options, PolishOptions
 from factorsfm.polish_start import polish_start
@@ -141,8 +141,7 @@ def polish(
     scale, wide, errors = sigma, float(np.sqrt(known.inflation)), None
     if o.observation_sigmas is None:
         state, errors = _with_track_errors(state, observations, sigma, free, o)
-        residual = BundleAdjustment(state, observations, o, sigma=1.0).reprojection_vectors()
-        scale, wide = errors.sigma, float(np.sqrt(block_inflation(errors.whitened(residual), observations)))
+        scale = errors.sigma
     # Pixel errors that repeat themselves, from frame to frame and among neighbours, weigh less; the kernel keeps its
     # width in pixels.
     final = replace(o, kernel=o.kernel / wide)

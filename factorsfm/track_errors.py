@@ -55,13 +55,6 @@ class TrackErrors:
         common = (self.sums(weighted) * self.shared)[..., self.stretch]
         return np.asarray(weighted - self.root_weight * common)
 
-    def whitened(self, residual: Array) -> Array:
-        """(m, 2) residuals without what they repeat within a stretch, at the same scale."""
-        size = np.diff(np.append(self.first, len(residual)))
-        power = np.add.reduceat(self.root_weight**2, self.first) * self.shared  # of the mean that is taken away
-        mean = np.add.reduceat(residual, self.first) / size[:, None]
-        return np.asarray(residual - ((1.0 - np.sqrt(1.0 - power))[:, None] * mean)[self.stretch])
-
     def cost(self, residual: Array) -> float:
         """Half the squared Mahalanobis norm of the residuals (m, 2), in units of `sigma`."""
         weighted = (residual * self.root_weight[:, None]).T

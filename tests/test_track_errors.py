@@ -49,17 +49,7 @@ def test_of_independent_errors_hardly_anything_is_taken_for_persistent(shot):
     error = drawn(o, np.zeros(len(shot.points)))
     errors = measure_track_errors(error, o, 2.0)
     assert (errors.shared * STRETCH).mean() < 0.15
-    np.testing.assert_allclose(np.std(errors.whitened(error)), np.std(error), rtol=0.05)
-
-
-def test_whitened_errors_do_not_repeat_themselves(shot):
-    o = shot.observations
-    error = drawn(o, np.full(len(shot.points), 0.2))
-    errors = measure_track_errors(error, o, 1e3)
-    whole = np.diff(np.append(errors.first, len(error))) == STRETCH
-    sums = np.add.reduceat(errors.whitened(error), errors.first)[whole]
-    assert np.std(sums) == pytest.approx(np.sqrt(STRETCH) * WHITE, rel=0.15)
-    assert np.std(np.add.reduceat(error, errors.first)[whole]) > 6.0 * np.std(sums) / 2.0
+    assert errors.sigma == pytest.approx(WHITE, rel=0.05)
 
 
 def problem_with_persistent_errors(shot, size, seed=0):
