@@ -143,7 +143,7 @@ def polish(
         state, errors = _with_track_errors(state, observations, sigma, free, o)
         scale = errors.sigma
     # Pixel errors that repeat themselves, from frame to frame and among neighbours, weigh less; the kernel keeps its
-    # width in pixels.
+    # width in pixels. What a track repeats is counted twice so: what neighbours repeat lasts longer than a stretch.
     final = replace(o, kernel=o.kernel / wide)
     if known.prior is not None:
         adjustment, prior = joint_problem(
