@@ -14,6 +14,8 @@ Index = NDArray[np.int64]
 
 # Camera-point block of the information matrix (columns, 3 n), its columns, and its points.
 Block = tuple[Array, Index, slice]
+# Rows of a frame, their columns, and the position of each entry among the columns; None: they are in order everywhere.
+Group = tuple[Index, Index, Index | None]
 
 _CHUNK = 512  # points eliminated together
 _ROWS = 16  # of a block worked on at once: they stay in the processor's cache
@@ -62,7 +64,7 @@ class Elimination:
 
     def __init__(self, columns: int, points: int) -> None:
         self._columns, self._points = columns, points
-        self._groups: list[list[tuple[Index, Index, Index]]] | None = None
+        self._groups: list[tuple[list[Group], Index, Index]] | None = None
         self._chunks: list[tuple[list[NDArray[np.intp]], Index, slice]] | None = None
 
     def normal_equations(self, terms: list[Term], *, cameras: bool = True) -> Normal:
@@ -70,21 +72,18 @@ class Elimination:
         c, n = self._columns, self._points
         camera, gradient = np.zeros((c, c)), np.zeros(c)
         point, point_gradient = np.zeros((n, 3, 3)), np.zeros((n, 3))
-        for t, groups in zip(terms, self._frame_groups(terms) if cameras else [[]] * len(terms), strict=True):
-            for rows, columns, local in groups:
-                entries = t.by_camera[:, :, rows]
-                dense = np.zeros((len(columns), *entries.shape[1:]))
-                if local.shape[0] == 1:
-                    dense[local[0]] = entries
-                else:
+        for t, (groups, seen, first) in zip(terms, self._frame_groups(terms), strict=True):
+            for rows, columns, local in groups if cameras else []:
+                dense = t.by_camera[:, :, rows]
+                if local is not None:
+                    entries, dense = dense, np.zeros((len(columns), *dense.shape[1:]))
                     np.put_along_axis(dense, np.broadcast_to(local.T[:, None], entries.shape), entries, 0)
-                dense = dense.reshape(len(columns), -1)
+                dense = dense.reshape(len(columns), dense.shape[1] * len(rows))
                 camera[np.ix_(columns, columns)] += dense @ dense.T
                 gradient[columns] += dense @ t.residual[:, rows].ravel()
             if t.errors is not None and cameras:
                 self._take_away_repeated(camera, t, t.errors, groups)
             by_point = t.decorrelated_by_point
-            seen, first = np.unique(t.point, return_index=True)
             for i in range(3):
                 point_gradient[seen, i] += np.add.reduceat((t.by_point[i] * t.residual).sum(0), first)
                 for j in range(i, 3):
@@ -94,9 +93,7 @@ class Elimination:
                         point[seen, j, i] += sums
         return Normal(camera, gradient, point, point_gradient, terms)
 
-    def _take_away_repeated(
-        self, camera: Array, t: Term, errors: TrackErrors, groups: list[tuple[Index, Index, Index]]
-    ) -> None:
+    def _take_away_repeated(self, camera: Array, t: Term, errors: TrackErrors, groups: list[Group]) -> None:
         """From the information of the cameras, what residuals of a stretch say again and again."""
         frames = np.array([t.frame[rows[0]] for rows, _, _ in groups])
         scale = errors.root_weight * np.sqrt(errors.shared)[errors.stretch]
@@ -106,28 +103,27 @@ class Elimination:
             seen = np.unique(errors.stretch[np.concatenate([rows for rows, _, _ in mine])])
             total = np.zeros((len(occurring), len(t.residual), len(seen)))
             for rows, columns, local in mine:
-                at = np.searchsorted(occurring, columns)[local.T if len(local) > 1 else local.T.repeat(len(rows), 1)]
+                at = np.searchsorted(occurring, columns)
+                at = at[:, None] if local is None else at[local.T]
                 place = np.searchsorted(seen, errors.stretch[rows])
                 for d in range(total.shape[1]):
                     total[at, d, place] += t.by_camera[:, d, rows] * scale[rows]
             flat = total.reshape(len(occurring), -1)
             camera[np.ix_(occurring, occurring)] -= flat @ flat.T
 
-    def _frame_groups(self, terms: list[Term]) -> list[list[tuple[Index, Index, Index]]]:
-        """For every term and frame: its rows, their columns, and the position of each entry among the columns.
-
-        The positions have a single row where they are the same for all rows of the frame.
-        """
+    def _frame_groups(self, terms: list[Term]) -> list[tuple[list[Group], Index, Index]]:
+        """For every term: its rows by frame; the points that occur, and the first row of each."""
         if self._groups is None:
             self._groups = []
             for t in terms:
                 order = np.argsort(t.frame, kind="stable")
-                groups = []
+                groups: list[Group] = []
                 for rows in np.split(order, np.nonzero(np.diff(t.frame[order]))[0] + 1):
                     mine = t.columns[rows]
-                    columns, local = self._occurring(mine[:1] if (mine == mine[:1]).all() else mine)
-                    groups.append((rows, columns, local[0]))
-                self._groups.append(groups)
+                    columns, (local,) = self._occurring(mine)
+                    same = local.shape[1] == len(columns) and bool((local == np.arange(len(columns))).all())
+                    groups.append((rows, columns, None if same else local))
+                self._groups.append((groups, *np.unique(t.point, return_index=True)))
         return self._groups
 
     def _chunk_indices(self, terms: list[Term]) -> list[tuple[list[NDArray[np.intp]], Index, slice]]:

@@ -138,14 +138,15 @@ class _Trial:
         sizes = [6] * len(self._poses) + [2] * len(self._affines) + [size] * bool(self._affines)
         ends = np.cumsum(sizes)
         spans = [slice(end - n, end) for end, n in zip(ends.tolist(), sizes, strict=True)]
+        zero = {(n, m): np.zeros((n, m)) for n in set(sizes) for m in (*set(sizes), 1)}
         pairs = gtsam.GaussianFactorGraph()
         for i, (key, a) in enumerate(zip(self.keys, spans, strict=True)):
             pairs.add(gtsam.HessianFactor(key, information[a, a], -gradient[a], 0.0))
-            none = np.zeros((sizes[i], sizes[i]))
+            mine = sizes[i]
             for other, b, n in zip(self.keys[i + 1 :], spans[i + 1 :], sizes[i + 1 :], strict=True):
                 pairs.add(
                     gtsam.HessianFactor(
-                        key, other, none, information[a, b], np.zeros(sizes[i]), np.zeros((n, n)), np.zeros(n), 0.0
+                        key, other, zero[mine, mine], information[a, b], zero[mine, 1], zero[n, n], zero[n, 1], 0.0
                     )
                 )
         return gtsam.HessianFactor(pairs)

@@ -109,7 +109,9 @@ def in_scene(marginals: Marginals, state: State, weights: Array) -> Array:
 
 def tangent_basis(bearing: Array) -> Array:
     """(n, 3, 2) orthonormal basis of the plane perpendicular to each unit vector."""
-    axis = np.where(np.abs(bearing[:, :1]) < 0.7, np.array([[1.0, 0.0, 0.0]]), np.array([[0.0, 1.0, 0.0]]))
-    first = np.cross(bearing, axis)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    return np.stack([first, np.cross(bearing, first)], -1)
+    x, y, z = bearing.T
+    upright = np.abs(x) < 0.7  # the cross product by the x axis, or by the y axis
+    a, b, c = np.where(upright, 0.0, -z), np.where(upright, z, 0.0), np.where(upright, -y, x)
+    length = np.sqrt(a * a + b * b + c * c)
+    a, b, c = a / length, b / length, c / length
+    return np.stack([a, y * c - z * b, b, z * a - x * c, c, x * b - y * a], -1).reshape(-1, 3, 2)

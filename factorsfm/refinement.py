@@ -84,6 +84,8 @@ class BundleAdjustment:
         self.track_errors = track_errors
         self.iterations = 0
         self._anchor = state.inverse_distance.copy()
+        typical = float(np.median(self._anchor)) if len(self._anchor) else 0.0
+        self._point_sigma = options.point_sigma * max(typical, 1e-9)
         self._focal_prior = focal_prior
         self._group = state.group[observations.frame]
         self._lens_sigmas = lens_sigmas
@@ -109,6 +111,7 @@ class BundleAdjustment:
         if not free_translation:
             free[: self._lens].reshape(-1, 6)[:, 3:] = False
         self._free = np.nonzero(free & (not points_only))[0]
+        self._lens_is_free = free_focal or lens_sigmas is not None
         self.free_lens = np.nonzero(free[self._lens : self._affine])[0]  # of log focal lengths and `State.lens`
         self._elimination = Elimination(self._columns, len(state.bearing))
 
@@ -198,10 +201,6 @@ class BundleAdjustment:
             cost += self.control.cost(state)
         return float(cost)
 
-    @property
-    def _point_sigma(self) -> float:
-        return self.options.point_sigma * max(float(np.median(self._anchor)), 1e-9)
-
     # --- linearisation ------------------------------------------------------------------------------------------
 
     def _terms(self) -> list[Term]:
@@ -211,14 +210,14 @@ class BundleAdjustment:
         errors = self.track_errors
         weight = np.sqrt(cauchy(residual, self.options.kernel)[1]) if errors is None else errors.root_weight
         gain = np.ascontiguousarray((by_q * weight[:, None, None]).transpose(1, 0, 2))
-        by_lens = (self._by_lens(residual, q) * weight[:, None, None]).transpose(1, 0, 2)
-        by_camera = np.concatenate([by_pose(gain, q, s.inverse_distance[o.point]), by_lens], 2)
+        by_camera, columns = by_pose(gain, q, s.inverse_distance[o.point]), 6 * o.frame[:, None] + np.arange(6)
+        if self._lens_is_free:
+            by_lens = (self._by_lens(residual, q) * weight[:, None, None]).transpose(1, 0, 2)
+            shape = np.broadcast_to(np.arange(self._shape, self._affine), (len(q), self._affine - self._shape))
+            by_camera = np.concatenate([by_camera, by_lens], 2)
+            columns = np.concatenate([columns, self._lens + self._group[:, None], shape], 1)
         by_bearing = s.rotation[o.frame] @ tangent[o.point]
         by_point = gain.transpose(1, 0, 2) @ np.concatenate([by_bearing, s.translation[o.frame][:, :, None]], 2)
-        shape = np.broadcast_to(np.arange(self._shape, self._affine), (len(q), self._affine - self._shape))
-        columns = np.concatenate(
-            [6 * o.frame[:, None] + np.arange(6), self._lens + self._group[:, None], shape], 1
-        )  # fmt: skip
         weighted = (residual * weight[:, None]).T
         terms = [
             Term(

@@ -11,14 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.factors import (
-    by_pose,
     camera_from_pose,
     camera_points,
     cauchy,
     image_depth_factor,
     image_reprojection_factor,
     pose_from_camera,
-    reprojection,
+    projection_by_pose,
 )
 
 Array = NDArray[np.float64]
@@ -152,16 +151,18 @@ def register_image(
 
 
 def _residuals(points: Array, observed: Array, rotation: Array, translation: Array, focal: float) -> Array:
-    q = camera_points(rotation, translation, points, np.ones(len(points)))
-    error = np.full(len(points), np.inf)
-    front = q[:, 2] > 1e-6
-    error[front] = np.linalg.norm(reprojection(q[front], focal * observed[front], focal)[0], axis=1)
-    return error
+    x, y, z = rotation @ points.T + translation[:, None]
+    behind = z <= 1e-6
+    z[behind] = 1.0
+    error = focal * np.hypot(x / z - observed[:, 0], y / z - observed[:, 1])
+    error[behind] = np.inf
+    return np.asarray(error)
 
 
 def _typical(error: Array) -> float:
     """What the median of the errors would be without outliers, which may be up to two thirds of them."""
-    return 1.39 * float(np.quantile(error, 0.3))
+    rank = int(0.3 * (len(error) - 1))
+    return 1.39 * float(np.partition(error, rank)[rank])
 
 
 def _optimize(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
@@ -185,18 +186,18 @@ def _align(
     Returns:
         Rotation, translation, and the information matrix of the pose.
     """
-    one = np.ones(len(points))
+    rows, seen = np.ascontiguousarray(points.T), (focal / sigma) * observed.T
     damping, best = 1e-6, np.inf
     normal, gradient = np.eye(6), np.zeros(6)
     candidate = rotation, translation
     for _ in range(_ALIGN_STEPS):
-        q = camera_points(*candidate, points, one)
-        front = q[:, 2] > 1e-6
-        q[~front, 2] = 1.0
-        residual, by_q = reprojection(q, focal * observed, focal)
-        residual, by_q = residual / sigma, by_q / sigma
-        residual[~front], by_q[~front] = _BEHIND, 0.0
-        costs, weight = cauchy(residual, _KERNEL)
+        q = candidate[0] @ rows + candidate[1][:, None]
+        behind = q[2] <= 1e-6
+        q[2, behind] = 1.0
+        prediction, by_pose = projection_by_pose(q, focal / sigma)
+        residual = prediction - seen
+        residual[:, behind], by_pose[:, :, behind] = _BEHIND, 0.0
+        costs, weight = cauchy(residual.T, _KERNEL)
         cost = float(costs.sum())
         if cost < best:
             settled = best - cost < tolerance * cost
@@ -204,9 +205,8 @@ def _align(
             best, damping = cost, damping / 10.0
             if settled:
                 break
-            jacobian = by_pose(by_q.transpose(1, 0, 2), q, one).reshape(-1, 6)
-            weighted = jacobian * np.tile(weight, 2)[:, None]
-            normal, gradient = weighted.T @ jacobian, weighted.T @ residual.T.ravel()
+            jacobian, weighted = by_pose.reshape(6, -1), (by_pose * weight).reshape(6, -1)
+            normal, gradient = weighted @ jacobian.T, weighted @ residual.ravel()
         else:
             damping = max(10.0 * damping, 1e-4)
         step = -np.linalg.solve(normal + damping * np.diag(normal.diagonal() + 1e-12), gradient)

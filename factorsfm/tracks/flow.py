@@ -33,6 +33,7 @@ _LEVELS = np.arange(256)
 _EXPOSURE_CHANGE = 4.0  # mean change of the grey levels between frames, with which it is made good
 _CHECK_INTERVAL = 2  # frames: the way back of an alignment is tried in turn
 _REPLENISH_INTERVAL, _FEW = 3, 0.7  # frames between looking for corners, unless so small a share of the tracks is left
+_MOST = 0.5  # share of the tracks that are where they should be, or all are looked for from scratch
 _BLANK_SHARE = 0.2  # of the texture of the last frame; with less, a frame among others is black or a flash
 
 
@@ -58,6 +59,12 @@ class TrackedFrame:
 class _Frame(NamedTuple):
     full: Image
     half: Image
+    levels: NDArray[np.float32]  # how often each grey level occurs in `half`
+
+    @classmethod
+    def of(cls, grey: Image) -> _Frame:
+        half = _halved(grey)
+        return cls(grey, half, cv2.calcHist([half], [0], None, [256], [0, 256]).ravel())
 
 
 class FlowTracker:
@@ -96,7 +103,7 @@ class FlowTracker:
             expected: ended tracks that are in view again, see `revive`; they come before new ones.
         """
         grey = np.ascontiguousarray(image) if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-        frame = _Frame(grey, _halved(grey))
+        frame = _Frame.of(grey)
         texture = _texture(frame.half)
         if texture < _BLANK_SHARE * self._texture:  # the tracks wait for the next frame that shows something
             return TrackedFrame(np.zeros(0, np.int64), np.zeros((0, 2)), 0, 0, texture)
@@ -194,7 +201,7 @@ class FlowTracker:
         for name in _STATE:
             setattr(self, name, state[name])
         previous = state["previous"]
-        self._previous = _Frame(previous, _halved(previous)) if previous is not None else None
+        self._previous = _Frame.of(previous) if previous is not None else None
         self._patches.restore(state["patches"])
         self._ended_patches.restore(state["ended"])
 
@@ -217,7 +224,8 @@ class FlowTracker:
         if ok.any():
             ok &= surprise < max(_SURPRISE_PX, _SURPRISE_RATIO * np.median(surprise[ok]))
         search = np.nonzero(~ok)[0]
-        new[search], ok[search] = self._search(previous, frame, old[search])
+        known = start[search] if ok.mean() > _MOST else None  # where most are lost, so is the prediction
+        new[search], ok[search] = self._search(previous, frame, old[search], known)
         self._motion = LocalMotion(old[ok], new[ok], grey.shape)
         linear = np.tile(np.eye(2, dtype=np.float32), (n, 1, 1))
         linear[ok] = self._motion.linear(old[ok])
@@ -250,30 +258,40 @@ class FlowTracker:
         change = _robust_fit(cause[scouts], found[seen] - predicted[scouts])
         return np.asarray(predicted + cause @ change, np.float32)
 
-    def _roughly(self, previous: _Frame, frame: _Frame, xy: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Flow of points in the images of half the size, whatever the motion; and where there is any."""
+    def _roughly(
+        self, previous: _Frame, frame: _Frame, xy: Array, start: Array | None = None
+    ) -> tuple[Array, NDArray[np.bool_]]:
+        """Flow of points in the images of half the size, and where there is any: near `start`, or anywhere."""
+        first = None if start is None else (start - 0.5) / 2
         found, status, _ = cv2.calcOpticalFlowPyrLK(
-            previous.half, frame.half, (xy - 0.5) / 2, None, winSize=self._window, maxLevel=self.options.levels - 1,
-            criteria=_COARSE,
+            previous.half, frame.half, (xy - 0.5) / 2, first, winSize=self._window,
+            maxLevel=self.options.levels - 1 if start is None else 1, criteria=_COARSE,
+            flags=0 if start is None else cv2.OPTFLOW_USE_INITIAL_FLOW,
         )  # fmt: skip
         return 2 * found + 0.5, status[:, 0] == 1
 
-    def _search(self, previous: _Frame, frame: _Frame, xy: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Flow of points, and whether the way back, tried from where it should end, stays there."""
+    def _search(
+        self, previous: _Frame, frame: _Frame, xy: Array, start: Array | None
+    ) -> tuple[Array, NDArray[np.bool_]]:
+        """Flow of points, and whether the way back, tried from where it should end, stays there.
+
+        Args:
+            start: where the points may be; None: anywhere.
+        """
 
         def part(rows: NDArray[np.intp]) -> tuple[Array, NDArray[np.bool_]]:
-            start = xy[rows]
-            rough, _ = self._roughly(previous, frame, start)
+            old = xy[rows]
+            rough, _ = self._roughly(previous, frame, old, None if start is None else start[rows])
             forward, status, _ = cv2.calcOpticalFlowPyrLK(
-                previous.full, frame.full, start, rough, winSize=self._window, maxLevel=0, criteria=_COARSE,
+                previous.full, frame.full, old, rough, winSize=self._window, maxLevel=0, criteria=_COARSE,
                 flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
             )  # fmt: skip
             back, status_back, _ = cv2.calcOpticalFlowPyrLK(
-                frame.full, previous.full, forward, start.copy(), winSize=self._window, maxLevel=1, criteria=_COARSE,
+                frame.full, previous.full, forward, old.copy(), winSize=self._window, maxLevel=1, criteria=_COARSE,
                 flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
             )  # fmt: skip
             ok = (status[:, 0] == 1) & (status_back[:, 0] == 1)
-            ok &= np.linalg.norm(back - start, axis=1) < self.options.flow_check_px
+            ok &= np.linalg.norm(back - old, axis=1) < self.options.flow_check_px
             return forward, ok
 
         return in_parts(part, len(xy), len(xy), self._pool) if len(xy) else (xy, np.zeros(0, bool))
@@ -330,7 +348,7 @@ def _robust_fit(cause: NDArray[np.float64], effect: Array) -> NDArray[np.float64
         normal = weighted.T @ cause + _FIT_RIDGE * np.eye(columns)
         solution = np.asarray(np.linalg.solve(normal, weighted.T @ effect), np.float64)
         error = np.linalg.norm(cause @ solution - effect, axis=1)
-        weight = 1.0 / (1.0 + (error / max(float(np.median(error)), _SURPRISE_PX)) ** 2)
+        weight = 1.0 / (1.0 + (error / max(float(np.sort(error)[rows // 2]), _SURPRISE_PX)) ** 2)
     return solution
 
 
@@ -343,12 +361,12 @@ def _halved(grey: Image) -> Image:
 
 def _exposed_as(previous: _Frame, frame: _Frame) -> _Frame:
     """The frame before with the exposure of the present one: grey levels that have the same rank."""
-    counts, target = (cv2.calcHist([f.half], [0], None, [256], [0, 256]).ravel() for f in (previous, frame))
+    counts, target = previous.levels, frame.levels
     levels = np.interp(np.cumsum(counts) / counts.sum(), np.cumsum(target) / target.sum(), _LEVELS)
     if counts @ np.abs(levels - _LEVELS) < _EXPOSURE_CHANGE * counts.sum():
         return previous
     table = np.rint(levels).astype(np.uint8)
-    return _Frame(*(np.asarray(cv2.LUT(image, table), np.uint8) for image in previous))
+    return _Frame(*(np.asarray(cv2.LUT(i, table), np.uint8) for i in (previous.full, previous.half)), target)
 
 
 def image_texture(grey: Image) -> float:
@@ -359,7 +377,8 @@ def image_texture(grey: Image) -> float:
 def _texture(half: Image) -> float:
     """Of the image of half the size, in grey levels of the whole."""
     # In floats: the rounding of 8 bits alone would look like texture.
-    return float(cv2.Laplacian(cv2.GaussianBlur(half.astype(np.float32), (0, 0), 0.7), cv2.CV_32F).std()) / 4
+    edges = cv2.Laplacian(cv2.GaussianBlur(half.astype(np.float32), (0, 0), 0.7), cv2.CV_32F)
+    return float(cv2.meanStdDev(edges)[1][0, 0]) / 4
 
 
 def _inside(xy: NDArray[np.floating[Any]], shape: tuple[int, ...], border: int) -> NDArray[np.bool_]:

@@ -16,7 +16,7 @@ Rows = NDArray[np.intp]
 
 _SUPPORT = 22  # half side of a stored patch: the window at half the birth's scale, with its margin
 _MARGIN = 1  # of a warped patch around the window: interpolation and derivative
-_STALE_PX = 0.05  # change of the map at the edge of the window with which a patch is warped again
+_STALE_PX = 0.1  # change of the map at the edge of the window with which a patch is warped again
 _EXPOSURE_CHANGE = 4.0  # grey levels, of the typical patch; without one it is up to 1.2, in fast motion more
 _WITNESSES = 64  # patches that tell of it
 _MOST_GAIN = 4.0  # of the contrast, between a patch and the image
@@ -24,6 +24,8 @@ _STOP = cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS
 _FINE = (_STOP, 20, 0.01)
 _ALL_GOOD = 0.7  # share of the checked ones that must come back, or the others are checked, too
 _BACK = (_STOP, 5, 0.03)  # the way back only has to tell whether it ends where it began
+
+_WORTH_TWO = 250  # tracks; for fewer, preparing the images twice takes longer than following half of them
 
 _LARGE, _SMALL = ("_patches", "_warped"), ("_affine", "_warped_by")
 
@@ -135,20 +137,23 @@ class BirthPatches:
             reach_px: largest distance from `start`.
         """
         self._wait()
+        self._warp(rows)
         checked = np.ones(len(rows), bool) if checked is None else checked
+        tiles = self._warped[self._slots[rows]]
+        if _exposure_changed(tiles, grey, start):  # only then: the fit would cost a little accuracy
+            tiles = _lit_as(tiles, grey, start)
 
         def part(index: Rows) -> tuple[Array, NDArray[np.bool_]]:
-            return self._align(grey, rows[index], start[index], check_px, reach_px, checked[index])
+            return self._align(grey, tiles[index], start[index], check_px, reach_px, checked[index])
 
         tile = 2 * self._half + 1
         room = (grey.shape[0] // tile) * (grey.shape[1] // tile)
         return in_parts(part, len(rows), room, pool)
 
     def _align(
-        self, grey: Image, rows: Rows, start: Array, check_px: float, reach_px: float, checked: NDArray[np.bool_]
+        self, grey: Image, tiles: Image, start: Array, check_px: float, reach_px: float, checked: NDArray[np.bool_]
     ) -> tuple[Array, NDArray[np.bool_]]:
-        self._warp(rows)
-        atlas, centers = _atlas(_lit_as(self._warped[self._slots[rows]], grey, start), grey.shape)
+        atlas, centers = _atlas(tiles, grey.shape)
         aligned, status, _ = cv2.calcOpticalFlowPyrLK(
             atlas, grey, centers, start.copy(), winSize=self._window, maxLevel=0, criteria=_FINE,
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
@@ -174,6 +179,8 @@ class BirthPatches:
         """Warp the patches whose map has changed."""
         change = np.abs(self._affine[rows] - self._warped_by[rows]).sum(axis=2).max(axis=1) * self._half
         stale = rows[change > _STALE_PX]
+        if not len(stale):
+            return
         slots = self._slots[stale]
         self._warped[slots] = _warped(self._patches[slots], self._affine[stale], self._half)
         self._warped_by[stale] = self._affine[stale]
@@ -183,7 +190,7 @@ def in_parts(
     function: Callable[[Rows], tuple[Array, NDArray[np.bool_]]], count: int, room: int, pool: ThreadPoolExecutor
 ) -> tuple[Array, NDArray[np.bool_]]:
     """`function` of the rows 0..count in parts of at most `room`, joined; two parts at least, for two cores."""
-    parts = np.array_split(np.arange(count), max(2 if count > 100 else 1, -(-count // room)))
+    parts = np.array_split(np.arange(count), max(2 if count > _WORTH_TWO else 1, -(-count // room)))
     values, flags = zip(*pool.map(function, parts), strict=True)
     return np.concatenate(values), np.concatenate(flags)
 
@@ -196,16 +203,25 @@ def _cut(grey: Image, xy: Array, half: int) -> Image:
     return np.asarray(np.lib.stride_tricks.sliding_window_view(padded, (side, side))[y, x], np.uint8)
 
 
-def _lit_as(tiles: Image, grey: Image, xy: Array) -> Image:
-    """Tiles (n, side, side) with the mean and the contrast of the image at these places, where the exposure changed.
+def _exposure_changed(tiles: Image, grey: Image, xy: Array) -> bool:
+    """Whether the image at these places is lighter or darker than the (n, side, side) tiles, as a few of them tell."""
+    half = tiles.shape[1] // 2
+    x, y = np.rint(xy).astype(int).T
+    h, w = grey.shape
+    inside = np.nonzero((x >= half) & (y >= half) & (x < w - half) & (y < h - half))[0]
+    if not len(inside):
+        return False
+    few = inside[:: -(-len(inside) // _WITNESSES)]
+    windows = np.lib.stride_tricks.sliding_window_view(grey, tiles.shape[1:])[y[few] - half, x[few] - half]
+    seen, known = (
+        cv2.reduce(a.reshape(len(few), -1), 1, cv2.REDUCE_AVG, dtype=cv2.CV_32F) for a in (windows, tiles[few])
+    )
+    return bool(abs(np.median(seen - known)) >= _EXPOSURE_CHANGE)
 
-    Nothing is done where it did not: the fit would cost a little accuracy.
-    """
+
+def _lit_as(tiles: Image, grey: Image, xy: Array) -> Image:
+    """Tiles (n, side, side) with the mean and the contrast of the image at these places."""
     n, side, _ = tiles.shape
-    few = slice(None, None, -(-n // _WITNESSES))
-    change = _cut(grey, xy[few], side // 2).mean(axis=(1, 2)) - tiles[few].mean(axis=(1, 2))
-    if abs(np.median(change)) < _EXPOSURE_CHANGE:
-        return tiles
     tile, seen = (a.reshape(n, -1).astype(np.float32) for a in (tiles, _cut(grey, xy, side // 2)))
     mean, seen_mean = (a.mean(axis=1, keepdims=True) for a in (tile, seen))
     tile -= mean
@@ -243,11 +259,11 @@ def _atlas(tiles: Image, shape: tuple[int, ...]) -> tuple[Image, Array]:
     """Square tiles laid out in one image of the frame's size, and their centres."""
     n, side, _ = tiles.shape
     columns = shape[1] // side
-    rows = -(-n // columns)
     atlas = np.zeros(shape, np.uint8)
-    padded = np.zeros((rows * columns, side, side), np.uint8)
-    padded[:n] = tiles
-    body = padded.reshape(rows, columns, side, side).transpose(0, 2, 1, 3)
-    atlas[: rows * side, : columns * side] = body.reshape(rows * side, columns * side)
+    place = atlas[: shape[0] // side * side, : columns * side].reshape(-1, side, columns, side)
+    full, rest = divmod(n, columns)
+    place[:full] = tiles[: full * columns].reshape(full, columns, side, side).transpose(0, 2, 1, 3)
+    if rest:
+        place[full, :, :rest] = tiles[full * columns :].transpose(1, 0, 2)
     r, c = np.divmod(np.arange(n), columns)
     return atlas, np.stack([c * side + side // 2, r * side + side // 2], -1).astype(np.float32)
