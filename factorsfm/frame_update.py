@@ -36,6 +36,10 @@ class FrameUpdate:
         dropped: frames that a live source dropped right before this one.
         shot: number of the shot in an `Episode`.
         focal_length: pixels, as the stream has it now; focal_changed: whether this frame changed it.
+        starts_anew: whether the start of the map was given up with this frame, because none of those that followed
+            joined it: all poses that were given before are void.
+        note: one sentence on what became of the map with this frame, where that is out of the ordinary: a start that
+            was given up, a depth prior without which the stream goes on; else empty.
     """
 
     index: int
@@ -53,3 +57,5 @@ class FrameUpdate:
     shot: int = 0
     focal_length: float = float("nan")
     focal_changed: bool = False
+    starts_anew: bool = False
+    note: str = ""

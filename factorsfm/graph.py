@@ -28,6 +28,7 @@ logger = logging.getLogger(__name__)
 
 _LARGEST_ERROR_PX = 10.0
 _LEAST_IN_FRONT = 0.7
+_MIRRORED = "the depth is mirrored: the scale of a prior is negative"
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,11 +37,13 @@ class UpdateResult:
 
     Attributes:
         covariance: (6, 6) of the pose of each free keyframe, by position (`FrameResult.covariance`).
+        mirrored: whether it was rolled back because the solution and the prior are each other's mirror image.
     """
 
     committed: bool
     reason: str
     covariance: dict[int, Array]
+    mirrored: bool = False
 
 
 class FactorGraph:
@@ -90,7 +93,7 @@ class FactorGraph:
         if reason:
             logger.warning("update at frame %d rolled back: %s", positions[-1], reason)
             adjustment.state = before
-            return UpdateResult(False, reason, {})
+            return UpdateResult(False, reason, {}, reason == _MIRRORED)
         self._isam, self._slots = trial.isam, trial.slots
         return UpdateResult(True, "committed", covariance)
 
@@ -167,5 +170,5 @@ def _fault(adjustment: BundleAdjustment) -> str:
     if not error < _LARGEST_ERROR_PX:
         return f"the median reprojection error is {error:.1f} pixels, at most {_LARGEST_ERROR_PX:.0f} expected"
     if (state.scale <= 0.0).any():
-        return "the depth is mirrored: the scale of a prior is negative"
+        return _MIRRORED
     return ""

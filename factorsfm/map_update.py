@@ -20,6 +20,7 @@ from factorsfm.initialization import lift
 from factorsfm.noise import typical_sigma
 from factorsfm.options import MapperOptions, PolishOptions
 from factorsfm.point_map import PointMap
+from factorsfm.prior_check import inconsistency
 from factorsfm.prior_term import joint_problem, usual_prior
 from factorsfm.problem import Observations, State
 from factorsfm.refinement import BundleAdjustment
@@ -33,7 +34,7 @@ _FREE_KEYFRAMES = 20  # that an update solves for; those before are constant
 _HELD_KEYFRAMES = 8  # constant ones that take part, with what they saw
 _LEAST_SHARED = 30  # landmarks by which a constant keyframe takes part
 _GROSS = 4.0  # times the threshold of an inlier: a young map is wrong, too, and long tracks are precious
-_YOUNG_KEYFRAMES = 6  # up to which a map that burn-ins have bent begins again
+YOUNG_KEYFRAMES = 6  # up to which a map is easily bent: by burn-ins, then it begins again, or by what is no prior
 _YOUNG_ITERATIONS = 20  # divided by the number of keyframes
 _TRIAL_ITERATIONS = 5  # that tell whether what rests is at odds with the others
 _SOLVER = replace(PolishOptions(), tolerance=1e-3)
@@ -59,6 +60,8 @@ class MapUpdate:
         outliers: tracks of the new keyframe whose point is elsewhere.
         focal: a better focal length (pixels), None where it stays as it is.
         burn_ins: tracks of what is laid over the images.
+        mirrored: see `UpdateResult`.
+        no_prior: whether the keyframes show that the depth prior is none; `reason` says why.
     """
 
     position: int
@@ -74,6 +77,8 @@ class MapUpdate:
     outliers: Index = field(default_factory=lambda: np.zeros(0, np.int64))
     focal: float | None = None
     burn_ins: Index = field(default_factory=lambda: np.zeros(0, np.int64))
+    mirrored: bool = False
+    no_prior: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +106,11 @@ class MapCopy:
         if self.newest.tracks.depth is None:
             self.newest.tracks = replace(self.newest.tracks, depth=read())
 
+    def without_prior(self) -> MapCopy:
+        """The same as if there were no prior."""
+        bare = [replace(image, tracks=replace(image.tracks, depth=None)) for image in self.keyframes]
+        return replace(self, keyframes=bare)
+
     def needed(self) -> MapCopy:
         """As much of it as makes a difference to an update, which does not grow with the length of the shot."""
         before, free = _taking_part(self.keyframes)
@@ -113,6 +123,8 @@ def update_map(copy: MapCopy, graph: FactorGraph) -> MapUpdate:
     """New landmarks, and what the graph makes of all keyframes around the new one."""
     o, newest = copy.options, copy.newest
     position, depth = newest.tracks.position, newest.tracks.depth
+    if o.graph_depth and len(copy.keyframes) <= YOUNG_KEYFRAMES and (reason := inconsistency(copy.keyframes)):
+        return MapUpdate(position, depth, False, reason, no_prior=True)
     guidance = DepthGuidance(o, copy.points)
     guidance.fit(newest)
     affine = {position: newest.affine} if newest.affine is not None else {}
@@ -132,7 +144,7 @@ def update_map(copy: MapCopy, graph: FactorGraph) -> MapUpdate:
         removed, ids = np.setdiff1d(ids, kept), kept
         adjustment, guided, result = _solved(copy, graph, window, held, ids, _YOUNG_ITERATIONS)
     if not result.committed:
-        return MapUpdate(position, depth, False, result.reason)
+        return MapUpdate(position, depth, False, result.reason, mirrored=result.mirrored)
     focal = _better_focal(adjustment, held) if copy.refine_focal and len(copy.keyframes) >= _LENS_KEYFRAMES else None
     update = _judged(copy, adjustment, window, held, ids, guided, result, focal)
     return replace(update, removed=np.union1d(update.removed, removed), burn_ins=burn_ins) if len(burn_ins) else update
@@ -177,7 +189,7 @@ def _lifted_anew(copy: MapCopy, window: list[MappedImage], ids: Index) -> Index:
         Those of its points that are left; all, as they are, where the map is not young or has not begun like that.
     """
     first, o = window[0].tracks, copy.options
-    if len(copy.keyframes) > _YOUNG_KEYFRAMES or first.depth is None:
+    if len(copy.keyframes) > YOUNG_KEYFRAMES or first.depth is None:
         return ids
     points, valid = lift(first.xy, first.depth)
     good = valid & np.isin(first.ids, ids)

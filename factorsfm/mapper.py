@@ -18,7 +18,7 @@ from factorsfm.given_covariance import given_covariance
 from factorsfm.graph_process import GraphProcess
 from factorsfm.images import ImageTracks, MappedImage, median_flow, renormalize, shared_tracks
 from factorsfm.initialization import NoStart, Start
-from factorsfm.map_update import MapCopy, MapUpdate, add_tracks
+from factorsfm.map_update import YOUNG_KEYFRAMES, MapCopy, MapUpdate, add_tracks
 from factorsfm.options import Options
 from factorsfm.point_map import PointMap
 from factorsfm.reconstruction import FrameStatus
@@ -31,12 +31,14 @@ Index = NDArray[np.int64]
 logger = logging.getLogger(__name__)
 
 _STATE = (
-    "focal", "first_focal", "keyframes", "new_points", "parallax", "started", "_waits_for_depth", "_due",
+    "focal", "first_focal", "keyframes", "new_points", "parallax", "started", "without_prior", "_waits_for_depth", "_due",
+    "_mirrored",
 )  # fmt: skip
 _DEPTH_PATIENCE = 3  # keyframes without a depth map after which one does without
 _LEAST_RELOCALIZED = 0.7  # of the similar corners must agree with the pose; in a whole view nine tenths do
 _NOT_JOINED = (FrameStatus.LOST, FrameStatus.TOO_FEW_INLIERS)
-_PATIENCE, _YOUNG_KEYFRAMES = 5, 2  # images that do not join a map, and its keyframes, with which it is given up
+_PATIENCE, _BARELY_STARTED = 5, 2  # images that do not join a map, and its keyframes, with which it is given up
+_MOST_MIRRORED = 3  # updates in a row; then it is the prior that is wrong, not the geometry
 _RUNNING_OUT = 0.5  # share of an image's tracks with a point, below which the map is extended at once
 _CONSENSUS = 0.8  # share of the inliers of the image before that is enough, however roughly they agree
 _SETTLED, _SETTLED_DELAY = 5, 2  # keyframes of a map that changes little; frames that it waits longer for the graph
@@ -65,6 +67,9 @@ class Mapper:
         self.burn_ins = np.zeros(0, np.int64)  # tracks that it showed to be laid over the image
         self.new_points = 0  # that came with the last image
         self.parallax = 0.0  # largest so far
+        self.note = ""  # what became of the map with the last image, where that is out of the ordinary
+        self.starts_anew = False  # whether the map was given up with the last image
+        self.without_prior = ""  # why the depth prior takes no part any more
         self._graph = graph
         self._update: Future[MapUpdate] | None = None
         self._due = 0
@@ -77,6 +82,7 @@ class Mapper:
         self.started = False
         self.points = PointMap()
         self._waits_for_depth = 0
+        self._mirrored = 0  # updates in a row that were rolled back as mirrored
 
     # --- snapshots ----------------------------------------------------------------------------------------------
 
@@ -129,6 +135,7 @@ class Mapper:
         self._advanced = len(self.images)
         self.outliers = self.burn_ins = np.zeros(0, np.int64)
         self.new_points = 0
+        self.note, self.starts_anew = "", False
         if self._update is not None and len(self.images) >= self._due:
             self._take_over()
 
@@ -149,6 +156,9 @@ class Mapper:
         hurry = self.points.contains(image.tracks.ids).mean() < _RUNNING_OUT
         if hurry:  # the camera is faster than the graph
             self._take_over()
+        if not self.started:
+            self._try_start(read_depth)
+            return
         self._register(image)
         if not image.registered and self._map_tracks(image):
             self._register(image)
@@ -159,6 +169,7 @@ class Mapper:
 
     def finish(self) -> None:
         """No more images: start with what there is, if nothing better came; all images on the map as it is at last."""
+        self._take_over()
         if not self.started:
             self._begin(self._starter.last_resort(self._waiting(), self.focal))
         self.refresh()
@@ -232,9 +243,11 @@ class Mapper:
             self._accept(image, known)
             self._add_keyframe(image, None)
             self._take_over()
+        if len(start.images) == 1:
+            image.message = f"the start of a map of {len(start.ids)} points, which no other image has joined yet"
         # Next image as COLMAP chooses it: the one that sees most of the map.
         remaining = [image for image in waiting if not image.registered]
-        while remaining:
+        while remaining and self.started:
             image = max(remaining, key=lambda i: int(self.points.contains(i.tracks.ids).sum()))
             remaining.remove(image)
             self._register(image)
@@ -250,7 +263,7 @@ class Mapper:
         joined = sum(image.registered for image in self.images)
         since = itertools.takewhile(lambda image: not image.registered, reversed(self.images))
         failed = [image.tracks for image in since if image.status in _NOT_JOINED]
-        if len(self.keyframes) > _YOUNG_KEYFRAMES or len(failed) <= max(_PATIENCE, joined):
+        if len(self.keyframes) > _BARELY_STARTED or len(failed) <= max(_PATIENCE, joined):
             return False
         return shared_tracks(failed[0], failed[_PATIENCE]) >= self.options.min_tracks
 
@@ -259,14 +272,18 @@ class Mapper:
         self._take_over()
         joined = sum(image.registered for image in self.images)
         last = max(k for k, image in enumerate(self.images) if image.registered)
-        logger.warning("the images that follow image %d do not join its map, starting anew", last)
         for k, image in enumerate(self.images):
             if k > last and image.status in _NOT_JOINED:
                 image.forget(FrameStatus.WAITING, "waiting for the start of another map")
             elif image.registered:
                 image.forget(FrameStatus.LOST, f"on a map of {joined} images that none of those that followed joined")
+        self._give_up_map(f"the images that follow image {last} do not join its map, starting anew")
+
+    def _give_up_map(self, reason: str) -> None:
         self._graph.start_anew()
         self.points, self.keyframes, self.parallax, self.started = PointMap(), [], 0.0, False
+        self.starts_anew, self.note = True, reason
+        logger.warning(reason)
 
     # --- registration -------------------------------------------------------------------------------------------
 
@@ -382,7 +399,9 @@ class Mapper:
         """Let the graph work on the keyframe; the map takes over its result after `graph_delay` frames."""
         keyframes = [replace(self.images[k]) for k in self.keyframes] + [replace(image)]
         copy = MapCopy(keyframes, self.points.copy(), self.options, self.focal, self._refine_focal)
-        read = read_depth if self._uses_keyframe_depth else None
+        if self.without_prior:
+            copy = copy.without_prior()
+        read = read_depth if self._guided else None
         self._update = self._graph.submit(copy, read)
         image.keyframe = True
         settled = _SETTLED_DELAY if len(self.keyframes) >= _SETTLED else 0
@@ -397,7 +416,10 @@ class Mapper:
         image = self.images[update.position]
         if image.tracks.depth is None and update.depth is not None:
             image.tracks = replace(image.tracks, depth=update.depth)
-        missing = self._uses_keyframe_depth and update.depth is None
+        self._doubt_prior(update)
+        if not self.started:
+            return
+        missing = self._guided and update.depth is None
         if missing and self.keyframes and self._waits_for_depth < _DEPTH_PATIENCE:
             self._waits_for_depth += 1  # another image may have a map
             image.keyframe = False
@@ -422,6 +444,32 @@ class Mapper:
         self._carry(update.position, before)
         if update.focal is not None:
             self._set_focal(update.focal)
+
+    @property
+    def _guided(self) -> bool:
+        """Whether the depth prior takes part in the updates of the map."""
+        return self._uses_keyframe_depth and not self.without_prior
+
+    def _doubt_prior(self, update: MapUpdate) -> None:
+        """Go on without the prior where it is none: it contradicts itself, or again and again the geometry.
+
+        A young map has the shape that it said, and so it is given up.
+        """
+        self._mirrored = self._mirrored + 1 if update.mirrored else 0
+        reason = update.reason if update.no_prior else ""
+        if self._mirrored >= _MOST_MIRRORED:
+            reason = f"the geometry is its mirror image in {self._mirrored} updates in a row"
+        if not reason or not self._guided:
+            return
+        self.without_prior, self._starter.kind = reason, "essential"
+        self.note = f"going on without the depth prior: {reason}"
+        if len(self.keyframes) > YOUNG_KEYFRAMES:
+            logger.warning(self.note)
+            return
+        for image in self.images:
+            if image.registered or image.status in _NOT_JOINED:
+                image.forget(FrameStatus.WAITING, "waiting for a start without the depth prior")
+        self._give_up_map(f"{self.note}; starting anew")
 
     def _set_focal(self, focal: float) -> None:
         """Normalise all that was seen with another focal length."""

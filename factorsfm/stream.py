@@ -390,7 +390,7 @@ class Stream(Closing):
         assert mapper is not None
         prior = None
         guided = [k for k in mapper.keyframes if mapper.images[k].affine and mapper.images[k].tracks.depth]
-        if guided:
+        if guided and not mapper.without_prior:
             keyframe = mapper.images[guided[-1]]
             assert keyframe.affine is not None
             assert keyframe.tracks.depth is not None
@@ -400,6 +400,7 @@ class Stream(Closing):
             frame.index, image.status, image.message, _pose(image), image.keyframe, len(image.tracks.ids),
             image.inliers, mapper.new_points, mapper.parallax, image.covariance, prior, frame.dropped,
             focal_length=mapper.focal, focal_changed=focal_changed,
+            starts_anew=mapper.starts_anew, note=mapper.note,
         )  # fmt: skip
 
     def _failure(self, message: str) -> ReconstructionError:

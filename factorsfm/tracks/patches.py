@@ -16,7 +16,7 @@ Rows = NDArray[np.intp]
 
 _SUPPORT = 22  # half side of a stored patch: the window at half the birth's scale, with its margin
 _MARGIN = 1  # of a warped patch around the window: interpolation and derivative
-_STALE_PX = 0.1  # change of the map at the edge of the window with which a patch is warped again
+_STALE_PX = 0.07  # change of the map at the edge of the window with which a patch is warped again
 _EXPOSURE_CHANGE = 4.0  # grey levels, of the typical patch; without one it is up to 1.2, in fast motion more
 _WITNESSES = 64  # patches that tell of it
 _MOST_GAIN = 4.0  # of the contrast, between a patch and the image
