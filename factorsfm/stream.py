@@ -298,6 +298,8 @@ class Stream(Closing):
         if self._without_depth:
             count, first = len(self._without_depth), next(iter(self._without_depth.values()))
             reconstruction.notes.append(f"Frames that went without depth because the prior failed: {count}; {first}.")
+        if mapper.without_prior:
+            reconstruction.notes.append(f"The map went on without the depth prior: {mapper.without_prior}.")
         self._thumbnails.attach(reconstruction.frames)
         return reconstruction
 

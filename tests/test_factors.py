@@ -22,6 +22,7 @@ from factorsfm.factors import (
     native_affine_noise,
     native_depth_factor,
     pose_from_camera,
+    projection_by_pose,
     reprojection,
     virtual_offset,
 )
@@ -164,6 +165,19 @@ def test_by_pose_is_the_derivative_by_gtsams_pose(image):
     np.testing.assert_allclose(q, camera_points(rotation, translation, points, w), atol=1e-12)
     analytic = np.stack([by_pose(np.broadcast_to(axis, q.shape), q, w) for axis in np.eye(3)], 1)
     assert_derivative(analytic, after, 6)
+
+
+@examples
+@given(images(), floats(200, 2000))
+def test_projection_by_pose_is_reprojection_chained_by_pose(image, focal):
+    rotation, translation, points, _ = image
+    one = np.ones(len(points))
+    q = camera_points(rotation, translation, points, one)
+    prediction, derivative = projection_by_pose(q.T, focal)
+    expected, by_q = reprojection(q, np.zeros((len(q), 2)), focal)
+    np.testing.assert_allclose(prediction.T, expected, rtol=1e-12)
+    chained = by_pose(by_q.transpose(1, 0, 2), q, one)
+    np.testing.assert_allclose(derivative, chained.transpose(2, 0, 1), rtol=1e-9, atol=1e-9 * focal)
 
 
 def test_poses_and_cameras_are_inverse():

@@ -24,6 +24,7 @@ from factorsfm import (
 )
 from factorsfm.camera import pixels_from_normalized
 from factorsfm.mapper import Mapper
+from factorsfm.evaluation.useless_priors import RandomSmoothPrior
 from factorsfm.synthetic import render_shot, simulate_prior
 
 QUICK = with_fewer_tracks(Options())
@@ -243,11 +244,52 @@ def test_a_map_that_the_following_frames_do_not_join_is_given_up(foreign):
     updates = [s.push(Frame(k, image, str(k))) for k, image in enumerate(images)]
     assert updates[0].status is FrameStatus.REGISTERED
     assert updates[-1].status is FrameStatus.REGISTERED
+    assert "no other image has joined yet" in updates[0].message
+    (anew,) = [update for update in updates if update.starts_anew]
+    assert anew.index >= foreign + 5
+    assert f"the images that follow image {foreign - 1} do not join its map, starting anew" in anew.note
+    assert [update.note for update in updates if update is not anew] == [""] * (len(updates) - 1)
     result = s.finish()
     assert [frame.status is FrameStatus.REGISTERED for frame in result.frames] == [False] * foreign + [True] * 14
     assert "none of those that followed joined" in result.frames[0].message
     own = replace(result, frames=result.frames[foreign:])
     assert np.median(errors_of(own, shot).ate) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("mirrored", "reason"),
+    [(False, "the order of its depths correlates"), (True, "the geometry is its mirror image in 3 updates in a row")],
+)
+def test_without_a_prior_that_is_none_the_stream_goes_on(mirrored, reason, caplog):
+    shot = render_shot("dolly", 30, 320, 180, 0.3)
+    maps = simulate_prior(shot)
+    far = 1.02 * max(values.max() for values in maps)
+    s = stream(camera=shot.camera, depth=Maps([far - values for values in maps]) if mirrored else RandomSmoothPrior())
+    updates = [s.push(image) for image in shot.images]
+    (anew,) = [update for update in updates if update.note]
+    assert anew.starts_anew
+    assert anew.note.startswith(f"going on without the depth prior: {reason}")
+    assert anew.note in caplog.text
+    assert anew.index < 26
+    assert all(update.cam_from_world is not None for update in updates[27:])
+    assert all(update.prior is None for update in updates[anew.index :])
+    result = s.finish()
+    assert [note for note in result.notes if reason in note]
+    assert len(result.registered) == 30
+    assert np.median(errors_of(result, shot).ate) < 0.002
+
+
+def test_a_prior_that_is_left_out_stays_so_in_a_snapshot(tmp_path):
+    shot = render_shot("dolly", 30, 320, 180, 0.3)
+    s = stream(camera=shot.camera, depth=RandomSmoothPrior())
+    updates = [s.push(image) for image in shot.images]
+    assert sum(update.starts_anew for update in updates) == 1
+    s.save(tmp_path / "state")
+    s.close()
+    again = Stream.load(tmp_path / "state", depth=Failing(set(range(99))))  # is not asked any more
+    for k in range(20, 30):
+        assert again.push(Frame(k + 10, shot.images[49 - k], str(k))).status is FrameStatus.REGISTERED
+    again.close()
 
 
 @pytest.mark.parametrize("preset", ["default", "paper"])

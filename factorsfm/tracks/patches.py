@@ -139,20 +139,20 @@ class BirthPatches:
         self._wait()
         self._warp(rows)
         checked = np.ones(len(rows), bool) if checked is None else checked
-        tiles = self._warped[self._slots[rows]]
-        if _exposure_changed(tiles, grey, start):  # only then: the fit would cost a little accuracy
-            tiles = _lit_as(tiles, grey, start)
 
         def part(index: Rows) -> tuple[Array, NDArray[np.bool_]]:
-            return self._align(grey, tiles[index], start[index], check_px, reach_px, checked[index])
+            return self._align(grey, rows[index], start[index], check_px, reach_px, checked[index])
 
         tile = 2 * self._half + 1
         room = (grey.shape[0] // tile) * (grey.shape[1] // tile)
         return in_parts(part, len(rows), room, pool)
 
     def _align(
-        self, grey: Image, tiles: Image, start: Array, check_px: float, reach_px: float, checked: NDArray[np.bool_]
+        self, grey: Image, rows: Rows, start: Array, check_px: float, reach_px: float, checked: NDArray[np.bool_]
     ) -> tuple[Array, NDArray[np.bool_]]:
+        tiles = self._warped[self._slots[rows]]
+        if _exposure_changed(tiles, grey, start):  # only then: the fit would cost a little accuracy
+            tiles = _lit_as(tiles, grey, start)
         atlas, centers = _atlas(tiles, grey.shape)
         aligned, status, _ = cv2.calcOpticalFlowPyrLK(
             atlas, grey, centers, start.copy(), winSize=self._window, maxLevel=0, criteria=_FINE,
