@@ -16,6 +16,8 @@ Index = NDArray[np.int64]
 Block = tuple[Array, Index, slice]
 # Rows of a frame, their columns, and the position of each entry among the columns; None: they are in order everywhere.
 Group = tuple[Index, Index, Index | None]
+# Flat positions of values, and whether no two have the same one.
+Places = tuple[NDArray[np.intp], bool]
 
 _CHUNK = 512  # points eliminated together
 _ROWS = 16  # of a block worked on at once: they stay in the processor's cache
@@ -65,7 +67,7 @@ class Elimination:
     def __init__(self, columns: int, points: int) -> None:
         self._columns, self._points = columns, points
         self._groups: list[tuple[list[Group], Index, Index]] | None = None
-        self._chunks: list[tuple[list[NDArray[np.intp]], Index, slice]] | None = None
+        self._chunks: list[tuple[list[Places], Index, slice]] | None = None
 
     def normal_equations(self, terms: list[Term], *, cameras: bool = True) -> Normal:
         """Information and gradient of the cameras, if wanted, and of each point; each term is sorted by point."""
@@ -74,7 +76,7 @@ class Elimination:
         point, point_gradient = np.zeros((n, 3, 3)), np.zeros((n, 3))
         for t, (groups, seen, first) in zip(terms, self._frame_groups(terms), strict=True):
             for rows, columns, local in groups if cameras else []:
-                dense = t.by_camera[:, :, rows]
+                dense = t.by_camera.take(rows, axis=2)
                 if local is not None:
                     entries, dense = dense, np.zeros((len(columns), *dense.shape[1:]))
                     np.put_along_axis(dense, np.broadcast_to(local.T[:, None], entries.shape), entries, 0)
@@ -126,8 +128,8 @@ class Elimination:
                 self._groups.append((groups, *np.unique(t.point, return_index=True)))
         return self._groups
 
-    def _chunk_indices(self, terms: list[Term]) -> list[tuple[list[NDArray[np.intp]], Index, slice]]:
-        """For every chunk of points: flat positions of the cross blocks of each term, the columns, the points."""
+    def _chunk_indices(self, terms: list[Term]) -> list[tuple[list[Places], Index, slice]]:
+        """For every chunk of points: places of each term's values in the cross blocks, the columns, the points."""
         if self._chunks is None:
             self._chunks = []
             n = self._points
@@ -138,7 +140,8 @@ class Elimination:
                 flat = []
                 for t, r, local in zip(terms, rows, locals_, strict=True):
                     position = local.T[:, None] * 3 * (end - begin) + 3 * (t.point[r] - begin)
-                    flat.append((position + np.arange(3)[:, None]).ravel())
+                    position = (position + np.arange(3)[:, None]).ravel()
+                    flat.append((position, np.bincount(position, minlength=1).max() <= 1))
                 self._chunks.append((flat, columns, slice(begin, end)))
         return self._chunks
 
@@ -157,11 +160,13 @@ class Elimination:
         for flat, columns, span in self._chunk_indices(normal.terms):
             n = span.stop - span.start
             cross = np.zeros(len(columns) * 3 * n)
-            for t, by_point, position in zip(normal.terms, by_points, flat, strict=True):
+            for t, by_point, (position, single) in zip(normal.terms, by_points, flat, strict=True):
                 rows = slice(*np.searchsorted(t.point, [span.start, span.stop]))
-                a, b = t.by_camera[:, :, rows], by_point[:, :, rows]
-                values = sum(a[:, None, d] * b[None, :, d] for d in range(a.shape[1]))
-                cross += np.bincount(position, np.ravel(values), len(cross))
+                values = np.einsum("cdm,pdm->cpm", t.by_camera[:, :, rows], by_point[:, :, rows]).ravel()
+                if single:
+                    cross[position] += values
+                else:
+                    cross += np.bincount(position, values, len(cross))
             blocks.append((cross.reshape(len(columns), 3 * n), columns, span))
         return blocks
 
