@@ -31,8 +31,8 @@ Index = NDArray[np.int64]
 logger = logging.getLogger(__name__)
 
 _STATE = (
-    "focal", "first_focal", "keyframes", "new_points", "parallax", "started", "without_prior", "_waits_for_depth", "_due",
-    "_mirrored",
+    "focal", "first_focal", "keyframes", "new_points", "parallax", "started", "without_prior",
+    "_waits_for_depth", "_due", "_mirrored",
 )  # fmt: skip
 _DEPTH_PATIENCE = 3  # keyframes without a depth map after which one does without
 _LEAST_RELOCALIZED = 0.7  # of the similar corners must agree with the pose; in a whole view nine tenths do

@@ -40,8 +40,8 @@ def _agreement(a: MappedImage, b: MappedImage) -> float | None:
     both = a.tracks.depth.valid[in_a] & b.tracks.depth.valid[in_b]
     if both.sum() < _LEAST_TRACKS:
         return None
-    ranks = [_ranks(depth.inverse_depth[rows][both]) for depth, rows in ((a.tracks.depth, in_a), (b.tracks.depth, in_b))]
-    return float(np.corrcoef(*ranks)[0, 1])
+    said = a.tracks.depth.inverse_depth[in_a][both], b.tracks.depth.inverse_depth[in_b][both]
+    return float(np.corrcoef(_ranks(said[0]), _ranks(said[1]))[0, 1])
 
 
 def _ranks(values: NDArray[np.float64]) -> NDArray[np.intp]:

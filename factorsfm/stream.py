@@ -23,7 +23,6 @@ from factorsfm.camera import (
     guess_camera,
     lens_shape,
     normalized_from_pixels,
-    pixels_from_normalized,
     with_focal,
 )
 from factorsfm.closing import Closing
@@ -41,17 +40,17 @@ from factorsfm.priors.masks import MaskPrior
 from factorsfm.reading import read_depth, read_mask
 from factorsfm.reconstruction import FrameResult, FrameStatus, Reconstruction
 from factorsfm.registration import ImageDepth
-from factorsfm.relocalization import Relocalizer
 from factorsfm.report.thumbnails import Thumbnails
 from factorsfm.result import assemble
 from factorsfm.snapshot import read_snapshot, write_snapshot
 from factorsfm.threads import OneThreadEach
+from factorsfm.tracks.colors import TrackColors
 from factorsfm.tracks.flow import BLANK_TEXTURE, FlowTracker
+from factorsfm.view_finder import ViewFinder
 
 logger = logging.getLogger(__name__)
 
-_STATE = ("_size", "_lens_given", "_colors", "_pixels", "_without_depth")
-_REVIVAL_INTERVAL = 5  # frames
+_STATE = ("_size", "_lens_given", "_pixels", "_without_depth")
 _LEAST_SIDE = 32  # pixels: room for the patches of the tracker
 
 
@@ -101,13 +100,13 @@ class Stream(Closing):
         self._depth = depth if self.options.uses_depth else None
         self._masks = masks
         self._tracker = FlowTracker(self.options.tracker)
-        self._relocalizer = Relocalizer()
+        self._finder = ViewFinder(self._tracker)
         self._thumbnails = Thumbnails()
         self._threads: OneThreadEach | None = None
         self._graph = GraphProcess()  # it starts while the source opens
         self._mapper: Mapper | None = None
         self._size = (0, 0)
-        self._colors = np.zeros((0, 3), np.uint8)
+        self._colors = TrackColors()
         self._pixels: list[NDArray[np.float64]] = []
         self._without_depth: dict[int, str] = {}  # why the prior failed, by the frame's index
 
@@ -134,8 +133,8 @@ class Stream(Closing):
             mask = read_mask(self._masks, frame)
         with self._timed("tracking"):
             grey = np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY), np.uint8)
-            tracked = self._tracker.track(grey, mask, self._expected(mapper))
-        self._remember_colors(frame.image, tracked.ids, tracked.xy)
+            tracked = self._tracker.track(grey, mask, self._finder.expected(mapper, self.camera))
+        self._colors.remember(frame.image, tracked.ids, tracked.xy)
         with self._timed("mapping"):
             mapper.advance()
         focal_changed |= self._follow_focal(mapper)
@@ -155,7 +154,7 @@ class Stream(Closing):
             self._tracker.avoid(mapper.burn_ins)
             self._forget(mapper, mapper.burn_ins)
         with self._timed("relocalization"):
-            self._keep_in_sight(image, grey, pixels)
+            self._pixels[-1] = self._finder.keep_in_sight(mapper, image, grey, self._pixels[-1], self.camera)
         if image.status is not FrameStatus.WAITING:  # it may still take part in the start
             _mark_blank(image, tracked.texture)
         return self._frame_update(frame, image, focal_changed)
@@ -176,7 +175,7 @@ class Stream(Closing):
         if self._mapper is None:
             return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
         ids, points = self._mapper.points.all()
-        return points, self._colors[ids]
+        return points, self._colors.table[ids]
 
     @property
     def tracks(self) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
@@ -201,9 +200,10 @@ class Stream(Closing):
                 "seconds": dict(self.seconds),
                 "frames": [astuple(frame) for frame in self.frames],
                 "tracker": self._tracker.state(),
-                "views": self._relocalizer.views,
+                "colors": self._colors.table,
+                "views": self._finder.relocalizer.views,
                 "thumbnails": self._thumbnails.state(),
-                "next_view": self._relocalizer.next_view,
+                "next_view": self._finder.relocalizer.next_view,
                 "mapper": self._mapper.state() if self._mapper is not None else None,
             },
         )
@@ -235,7 +235,8 @@ class Stream(Closing):
         self.seconds.update(state["seconds"])
         self.frames = [SeenFrame(*frame) for frame in state["frames"]]
         self._tracker.restore(state["tracker"])
-        self._relocalizer = Relocalizer(state["views"], state["next_view"])
+        self._finder = ViewFinder(self._tracker, state["views"], state["next_view"])
+        self._colors = TrackColors(state["colors"])
         self._thumbnails.restore(state["thumbnails"])
         if state["mapper"] is not None:
             self._mapper = self._new_mapper()
@@ -287,7 +288,7 @@ class Stream(Closing):
             mapper.images,
             self.frames,
             self._pixels,
-            self._colors,
+            self._colors.table,
             self.camera,
             lens_given=self._lens_given,
             prior_given=self._depth is not None,
@@ -320,43 +321,12 @@ class Stream(Closing):
         if self._threads is not None:
             self._threads.close()
 
-    def _keep_in_sight(self, image: MappedImage, grey: NDArray[np.uint8], pixels: NDArray[np.float64]) -> None:
-        """Find the view again where it was lost, and take up the tracks whose points it shows."""
-        mapper = self._mapper
-        assert mapper is not None
-        if image.keyframe:
-            self._relocalizer.remember(grey, image.tracks.ids, pixels)
-        if mapper.started and not image.registered:
-            ids, rows = self._relocalizer.find(grey, pixels)
-            if mapper.relocalize(image, ids, image.tracks.xy[rows]):
-                revived, seen = self._tracker.revive(grey, *self._in_view(mapper, image))
-                self._add_tracks(image, revived, seen)
-
     def _forget(self, mapper: Mapper, ids: NDArray[np.int64]) -> None:
         """Tracks are left out of the images before the newest, which the graph may be working on."""
         for k, image in enumerate(mapper.images[:-1]):
             keep = ~np.isin(image.tracks.ids, ids)
             if not keep.all():
                 image.tracks, self._pixels[k] = image.tracks.of(keep), self._pixels[k][keep]
-
-    def _add_tracks(self, image: MappedImage, ids: NDArray[np.int64], xy: NDArray[np.float64]) -> None:
-        """Tracks that were found in the newest image after it had been mapped."""
-        joined = image.tracks.joined(ids, normalized_from_pixels(self.camera, xy))
-        order = np.argsort(joined.ids)
-        image.tracks, self._pixels[-1] = joined.of(order), np.r_[self._pixels[-1], xy][order]
-
-    def _expected(self, mapper: Mapper) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
-        """Now and then, the ended tracks that the last image should show."""
-        last = mapper.images[-1] if mapper.images else None
-        if last is None or not last.registered or len(mapper.images) % _REVIVAL_INTERVAL:
-            return None
-        return self._in_view(mapper, last)
-
-    def _in_view(self, mapper: Mapper, image: MappedImage) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Ended tracks with a point in front of an image, and where it is seen (pixels)."""
-        assert self.camera is not None
-        ids, xy = mapper.visible(image, self._tracker.ended)
-        return ids, pixels_from_normalized(self.camera, xy)
 
     def _open(self, frame: Frame) -> Mapper:
         """Everything that waits for the size of the first frame."""
@@ -432,17 +402,6 @@ class Stream(Closing):
                 logger.warning("%s; the frame goes without", error)
                 self._without_depth[frame.index] = str(error)
                 return None
-
-    def _remember_colors(self, image: NDArray[np.uint8], ids: NDArray[np.int64], xy: NDArray[np.float64]) -> None:
-        """Colour of each track at its first appearance, RGB."""
-        fresh = ids >= len(self._colors)
-        if not fresh.any():
-            return
-        x, y = np.rint(xy[fresh]).astype(int).T
-        pixels = image[y, x].reshape(int(fresh.sum()), -1)
-        added = np.zeros((int(ids.max()) + 1 - len(self._colors), 3), np.uint8)
-        added[ids[fresh] - len(self._colors)] = pixels[:, ::-1]
-        self._colors = np.concatenate([self._colors, added])
 
     @contextmanager
     def _timed(self, stage: str) -> Iterator[None]:

@@ -366,7 +366,8 @@ def _exposed_as(previous: _Frame, frame: _Frame) -> _Frame:
     if counts @ np.abs(levels - _LEVELS) < _EXPOSURE_CHANGE * counts.sum():
         return previous
     table = np.rint(levels).astype(np.uint8)
-    return _Frame(*(np.asarray(cv2.LUT(i, table), np.uint8) for i in (previous.full, previous.half)), target)
+    full, half = (np.asarray(cv2.LUT(image, table), np.uint8) for image in (previous.full, previous.half))
+    return _Frame(full, half, target)
 
 
 def image_texture(grey: Image) -> float:
