@@ -138,7 +138,7 @@ def test_a_reader_that_fails_says_so(graph, shot):
 
 
 def test_errors_of_an_update_are_raised_here(graph, shot):
-    with pytest.raises(AttributeError, match="registration_depth") as caught:
+    with pytest.raises(AttributeError, match="graph_depth") as caught:
         graph.submit(replace(shot.copy(2), options=None), None).result()
     assert "map_update.py" in caught.value.__notes__[0]
     assert graph.submit(shot.copy(2), None).result().committed
