@@ -140,12 +140,24 @@ class BirthPatches:
         self._warp(rows)
         checked = np.ones(len(rows), bool) if checked is None else checked
 
-        def part(index: Rows) -> tuple[Array, NDArray[np.bool_]]:
-            return self._align(grey, rows[index], start[index], check_px, reach_px, checked[index])
-
         tile = 2 * self._half + 1
-        room = (grey.shape[0] // tile) * (grey.shape[1] // tile)
-        return in_parts(part, len(rows), room, pool)
+        columns = grey.shape[1] // tile
+        order = np.argsort(start[:, 1], kind="stable")
+        margin = self._half + int(np.ceil(reach_px)) + _MARGIN
+
+        def part(index: Rows) -> tuple[Array, NDArray[np.bool_]]:
+            """In a band of the image: preparing all of it for each part takes longer than following many points."""
+            mine = order[index]
+            height = max(-(-len(mine) // columns) * tile, int(np.ptp(start[mine, 1])) + 2 * margin)
+            top = int(np.clip(start[mine[0], 1] - margin, 0, max(0, grey.shape[0] - height)))
+            shift = np.array([0, top], np.float32)
+            band = grey[top : top + height]
+            found, good = self._align(band, rows[mine], start[mine] - shift, check_px, reach_px, checked[mine])
+            return found + shift, good
+
+        found, good = in_parts(part, len(rows), columns * (grey.shape[0] // tile), pool)
+        back = np.argsort(order)
+        return found[back], good[back]
 
     def _align(
         self, grey: Image, rows: Rows, start: Array, check_px: float, reach_px: float, checked: NDArray[np.bool_]
