@@ -84,10 +84,11 @@ def test_errors_in_standard_deviations(shots):
     assert np.nanmax(np.delete(off, 5)) < 0.1
 
 
-def line(index: int, shot: Material, k: int, shift: float = 0.0, number: int = 0) -> str:
+def line(index: int, shot: Material, k: int, shift: float = 0.0, number: int = 0, *, anew: bool = False) -> str:
     pose = pycolmap.Rigid3d(pycolmap.Rotation3d(shot.rotations[k]), shot.centers[k] + [0.0, shift, 0.0]).inverse()
     covariance = np.diag([1e-6] * 6).tolist()
-    return json.dumps({"index": index, "shot": number, "pose": pose.matrix().tolist(), "covariance": covariance})
+    content = {"index": index, "shot": number, "pose": pose.matrix().tolist(), "covariance": covariance}
+    return json.dumps({**content, "starts_anew": anew})
 
 
 def test_wrong_poses_are_seen(shots, tmp_path):
@@ -105,6 +106,14 @@ def test_wrong_poses_are_seen(shots, tmp_path):
     assert faults._wrong_updates(log, made) == [
         f"frame {k} has a pose, but shows nothing of the shot" for k in (4, 6)
     ]  # fmt: skip
+
+
+def test_what_was_declared_void_is_not_wrong(shots, tmp_path):
+    log, made = tmp_path / "updates.jsonl", Plan([], shots, items(shots))
+    made.items[0] = Item(made.items[0].image, None)
+    for anew, wrong in ((2, []), (0, ["frame 0 has a pose, but shows nothing of the shot"])):
+        log.write_text("\n".join(line(k, shots[0], k, anew=k == anew) for k in range(FRAMES)))
+        assert faults._wrong_updates(log, made) == wrong
 
 
 def test_every_kind_of_end_is_counted():

@@ -70,17 +70,17 @@ def test_resumed_it_is_as_if_it_had_never_ended(tmp_path, whole, count):
         assert (update.keyframe, update.tracks, update.new_points) == (
             expected.keyframe, expected.tracks, expected.new_points,
         )  # fmt: skip
-        np.testing.assert_allclose(pose(update), pose(expected), atol=1e-8)
-        np.testing.assert_allclose(update.parallax, expected.parallax, atol=1e-8)
+        np.testing.assert_allclose(pose(update), pose(expected), atol=1e-7)  # the graph is another one
+        np.testing.assert_allclose(update.parallax, expected.parallax, atol=1e-7)
         if expected.covariance is not None:
-            np.testing.assert_allclose(update.covariance, expected.covariance, rtol=1e-6, atol=1e-12)
+            np.testing.assert_allclose(update.covariance, expected.covariance, rtol=1e-5, atol=1e-12)
     resumed = again.finish()
     assert resumed.notes == result.notes
     np.testing.assert_array_equal(resumed.track_ids, result.track_ids)
     np.testing.assert_array_equal(resumed.colors, result.colors)
     np.testing.assert_allclose(resumed.points, result.points, atol=1e-5)  # as exact as the solver
     for frame, expected_frame in zip(resumed.frames, result.frames, strict=True):
-        np.testing.assert_allclose(pose(frame), pose(expected_frame), atol=1e-8)
+        np.testing.assert_allclose(pose(frame), pose(expected_frame), atol=1e-7)
         assert (frame.status, frame.name) == (expected_frame.status, expected_frame.name)
 
 
