@@ -23,8 +23,8 @@ from factorsfm import (
     Stream,
 )
 from factorsfm.camera import pixels_from_normalized
-from factorsfm.mapper import Mapper
 from factorsfm.evaluation.useless_priors import RandomSmoothPrior
+from factorsfm.mapper import Mapper
 from factorsfm.synthetic import render_shot, simulate_prior
 
 QUICK = with_fewer_tracks(Options())
