@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import logging
-import math
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import replace
@@ -13,16 +12,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.factors import camera_points
 from factorsfm.given_covariance import given_covariance
 from factorsfm.graph_process import GraphProcess
 from factorsfm.images import ImageTracks, MappedImage, median_flow, renormalize, shared_tracks
 from factorsfm.initialization import NoStart, Start
+from factorsfm.map_registration import NotOnMap, register_by_corners, register_on_map
 from factorsfm.map_update import YOUNG_KEYFRAMES, MapCopy, MapUpdate, add_tracks
 from factorsfm.options import Options
 from factorsfm.point_map import PointMap
 from factorsfm.reconstruction import FrameStatus
-from factorsfm.registration import ImageDepth, Registration, register_image
+from factorsfm.registration import ImageDepth, Registration
 from factorsfm.starting import Starter
 
 Array = NDArray[np.float64]
@@ -35,12 +34,10 @@ _STATE = (
     "_waits_for_depth", "_due", "_mirrored",
 )  # fmt: skip
 _DEPTH_PATIENCE = 3  # keyframes without a depth map after which one does without
-_LEAST_RELOCALIZED = 0.7  # of the similar corners must agree with the pose; in a whole view nine tenths do
 _NOT_JOINED = (FrameStatus.LOST, FrameStatus.TOO_FEW_INLIERS)
 _PATIENCE, _BARELY_STARTED = 5, 2  # images that do not join a map, and its keyframes, with which it is given up
 _MOST_MIRRORED = 3  # updates in a row; then it is the prior that is wrong, not the geometry
 _RUNNING_OUT = 0.5  # share of an image's tracks with a point, below which the map is extended at once
-_CONSENSUS = 0.8  # share of the inliers of the image before that is enough, however roughly they agree
 _SETTLED, _SETTLED_DELAY = 5, 2  # keyframes of a map that changes little; frames that it waits longer for the graph
 _REACH = 60  # images to both sides of a lost one from which its tracks are triangulated
 _LEAST_SHARED = 0.7  # of the tracks of the last keyframe; with fewer, a new one is made
@@ -288,43 +285,12 @@ class Mapper:
     # --- registration -------------------------------------------------------------------------------------------
 
     def _register(self, image: MappedImage) -> None:
-        """PnP on the mapped tracks, then refinement with the depth prior where the options say so."""
-        o = self.options
-        tracks = image.tracks
-        mapped = self.points.contains(tracks.ids)
-        if mapped.sum() < o.min_inliers:
-            image.status = FrameStatus.LOST
-            image.message = f"{mapped.sum()} of {o.min_inliers} needed tracks have a point in the map"
-            return
-        near = image if image.registered else self._nearest_registered(tracks.position)
-        depth = None
-        if o.registration_depth != "none" and tracks.depth is not None:
-            depth = tracks.depth.of(mapped)
-        result = register_image(
-            self.points.at(tracks.ids[mapped]),
-            tracks.xy[mapped],
-            *near.pose,
-            focal=self.focal,
-            sigma=o.pixel_sigma,
-            inlier_px=o.inlier_px,
-            depth=depth,
-            domain="depth" if o.registration_depth == "paper" else "inverse",
-            depth_weight=o.depth_weight,
-        )
-        found = int(result.inliers.sum())
-        # More agree by chance within a threshold that is suddenly wider, and what is seen may be something else: the
-        # more of its area is new, the more of the inliers before must still be there. A young map is always rough.
-        new_area = max(0.0, 1.0 - (near.threshold / result.threshold) ** 2)
-        most = max(o.min_inliers, _CONSENSUS * near.inliers)
-        needed = math.ceil(o.min_inliers + new_area**2 * (most - o.min_inliers))
-        if found < needed:
-            image.status = FrameStatus.TOO_FEW_INLIERS
-            within = f"within {result.threshold:.1f} pixels among {mapped.sum()} mapped tracks"
-            image.message = f"{found} of {needed} needed inliers {within}"
-            return
-        inliers = np.zeros(len(tracks.ids), bool)
-        inliers[np.nonzero(mapped)[0][result.inliers]] = True
-        self._accept(image, replace(result, inliers=inliers))
+        near = image if image.registered else self._nearest_registered(image.tracks.position)
+        found = register_on_map(image, self.points, near, self.focal, self.options)
+        if isinstance(found, NotOnMap):
+            image.status, image.message = found.status, found.message
+        else:
+            self._accept(image, found)
 
     def relocalize(self, image: MappedImage, ids: Index, xy: Array) -> bool:
         """Register an image by what its descriptors say that it shows; whether that worked.
@@ -332,31 +298,15 @@ class Mapper:
         Args:
             ids: (n,) tracks that look like corners of the image; xy: (n, 2) these corners, normalised.
         """
-        o = self.options
-        known = self.points.contains(ids)
-        if known.sum() < o.min_inliers:
-            return False
         near = self._nearest_registered(image.tracks.position)
-        result = register_image(
-            self.points.at(ids[known]), xy[known], *near.pose,
-            focal=self.focal, sigma=o.pixel_sigma, inlier_px=o.inlier_px,
-        )  # fmt: skip
-        found = int(result.inliers.sum())
-        if found < max(o.min_inliers, _LEAST_RELOCALIZED * known.sum()):
-            image.message += f"; not found again: {found} of {known.sum()} similar corners agree"
+        result, agree = register_by_corners(ids, xy, self.points, near, self.focal, self.options)
+        if result is None:
+            image.message += f"; not found again: {agree}" if agree else ""
             return False
         self._accept(image, replace(result, inliers=np.zeros(len(image.tracks.ids), bool)))
-        image.inliers = found
-        image.message = f"found again: {found} of {known.sum()} similar corners agree"
+        image.inliers = int(result.inliers.sum())
+        image.message = f"found again: {agree}"
         return True
-
-    def visible(self, image: MappedImage, ids: Index) -> tuple[Index, Array]:
-        """Tracks with a point in front of a registered image, and where it is seen (normalised)."""
-        ids = ids[self.points.contains(ids)]
-        rotation, translation = image.pose
-        q = camera_points(rotation, translation, self.points.at(ids), np.ones(len(ids)))
-        front = q[:, 2] > 1e-6
-        return ids[front], q[front, :2] / q[front, 2:]
 
     def _nearest_registered(self, position: int) -> MappedImage:
         for offset in range(1, len(self.images)):

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from factorsfm.camera import normalized_from_pixels, pixels_from_normalized
 from factorsfm.images import MappedImage
+from factorsfm.map_registration import visible
 from factorsfm.mapper import Mapper
 from factorsfm.relocalization import Relocalizer, View
 from factorsfm.tracks.flow import FlowTracker
@@ -65,5 +66,5 @@ class ViewFinder:
 
     def _in_view(self, mapper: Mapper, image: MappedImage, camera: pycolmap.Camera) -> tuple[Index, Array]:
         """Ended tracks with a point in front of an image, and where it is seen (pixels)."""
-        ids, xy = mapper.visible(image, self._tracker.ended)
+        ids, xy = visible(image, mapper.points, self._tracker.ended)
         return ids, pixels_from_normalized(camera, xy)
