@@ -14,7 +14,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.plan import AS_SET, CRF_30, DEGRADED, FEW, FIRST_10, FIRST_20, FULL, NO_PRIOR
+from benchmarks.plan import (
+    AS_SET,
+    CRF_30,
+    DEGRADED,
+    DRAWS,
+    FEW,
+    FIRST_10,
+    FIRST_20,
+    FULL,
+    NO_PRIOR,
+    drawn,
+    undrawn,
+)
 from factorsfm import DepthFolder, DepthKind, DepthMap, DepthModel, DepthPrior, Frame, InputError
 from factorsfm.evaluation.degrade import degraded_frames
 from factorsfm.evaluation.readers import read_shot
@@ -50,6 +62,8 @@ VARIANTS = {
     CRF_30: Variant(frames=30),
     AS_SET: Variant(),
 }
+VARIANTS |= {drawn(name, draw): variant for name, variant in VARIANTS.items() for draw in DRAWS}
+_FAINT = 0.5  # grey levels
 
 
 def shot_folder(data: Path, name: str) -> Path:
@@ -77,11 +91,19 @@ def open_shot(data: Path, name: str, variant: str) -> Shot:
 def open_frames(shot: Shot, variant: str) -> Iterator[Frame]:
     """The frames as the variant has them."""
     frames = islice(shot.frames(), VARIANTS[variant].frames)
-    if variant == DEGRADED:
+    name, draw = undrawn(variant)
+    if draw:
+        frames = (_with_faint_noise(frame, draw) for frame in frames)
+    if name == DEGRADED:
         return degraded_frames(frames)
-    if variant == CRF_30:
+    if name == CRF_30:
         return compressed_frames(frames, crf=30)
     return frames
+
+
+def _with_faint_noise(frame: Frame, draw: int) -> Frame:
+    noise = np.random.default_rng([draw, frame.index]).normal(0.0, _FAINT, frame.image.shape)
+    return replace(frame, image=np.clip(np.round(frame.image + noise), 0, 255).astype(np.uint8))
 
 
 def compressed_frames(frames: Iterable[Frame], crf: int) -> Iterator[Frame]:

@@ -31,6 +31,18 @@ NOISE = ("noise-0", "noise-0.1", "noise-0.2", "noise-0.4")
 
 FULL, FIRST_10, FIRST_20, FEW, DEGRADED, CRF_30 = "full", "first-10", "first-20", "tracks-40", "degraded", "crf-30"
 AS_SET = "as-set"  # the frames as an unordered set
+DRAWS = (1, 2, 3)  # of faint noise, to tell what is luck
+
+
+def drawn(variant: str, draw: int) -> str:
+    """The variant with noise that no eye sees over its frames: other tracks survive."""
+    return f"{variant}~{draw}"
+
+
+def undrawn(variant: str) -> tuple[str, int]:
+    """The variant without the noise, and the number of the draw, 0 for none."""
+    name, _, draw = variant.partition("~")
+    return name, int(draw or 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +97,11 @@ EXPERIMENTS: dict[str, list[Cell]] = {
     "few": _cells(STUDIO, _THREE, _BOTH, (FEW,)),
     "degraded": _cells(STUDIO, (*_THREE, "colmap_tuned"), _BOTH, (DEGRADED, CRF_30)),
     "useless": _cells(STUDIO, ("default", "geometry"), USELESS),
+    "luck": [
+        *_cells(STUDIO, _THREE, _BOTH, [drawn(FULL, k) for k in DRAWS]),
+        *_cells(STUDIO[3:5] + STUDIO[6:], _THREE, _BOTH, [drawn(FEW, k) for k in DRAWS]),
+        *_cells(STUDIO[4:5], _THREE, _BOTH, [drawn(DEGRADED, k) for k in DRAWS]),
+    ],
     "networks": _cells(STUDIO, ("default",), (*NETWORKS, "simulated"))
     + _cells(SENSOR, ("default",), (*NETWORKS, "sensor")),
     "noise": _cells(STUDIO, ("default", "paper"), NOISE),

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 import factorsfm
 from benchmarks.inputs import shot_folder
-from benchmarks.plan import COLMAP, CRF_30, DEGRADED, Cell
+from benchmarks.plan import COLMAP, CRF_30, DEGRADED, Cell, undrawn
 from factorsfm.evaluation.metrics import DepthErrors, TrajectoryErrors, rotation_angle, trajectory_errors
 
 Array = NDArray[np.float64]
@@ -87,7 +87,7 @@ def cell_key(cell: Cell, data: Path) -> str:
     folder = shot_folder(data, cell.shot)
     truth = hashlib.sha256((folder / "groundtruth.txt").read_bytes() + (folder / "camera.json").read_bytes())
     depends: dict[str, str] = {**asdict(cell), "truth": truth.hexdigest(), "code": code_version(cell.method)}
-    if cell.variant in (DEGRADED, CRF_30):
+    if undrawn(cell.variant)[0] in (DEGRADED, CRF_30):
         depends["degrade"] = _fingerprint([_DEGRADE])
     return hashlib.sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()[:12]
 

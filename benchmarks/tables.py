@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import figures
-from benchmarks.comparison import POSE, against_colmap, no_harm
+from benchmarks.comparison import POSE, against_colmap, luck, no_harm
 from benchmarks.markdown import table
 from benchmarks.plan import COLMAP, DEGRADED, KITCHEN, OTHERS, STUDIO
 from benchmarks.scores import (
@@ -47,7 +47,13 @@ def draw(output: Path, cache: Path) -> None:
     for name, (title, section) in SECTIONS.items():
         if name in experiments:
             parts += [f"## {title}", *section(experiments[name], output)]
-    parts += [*against_colmap(experiments), *no_harm(experiments), *_cost(experiments), *_failures(experiments)]
+    parts += [
+        *against_colmap(experiments),
+        *no_harm(experiments),
+        *luck(experiments),
+        *_cost(experiments),
+        *_failures(experiments),
+    ]
     if any(parallax_of(record) for records in experiments.values() for record in records):
         figures.parallax_histogram([r for records in experiments.values() for r in records], output / "parallax.png")
         parts += ["## Parallax of the shots", "![Number of shots by parallax](parallax.png)"]
