@@ -39,14 +39,26 @@ RESULT, ROWS = _RESULTS / "LENS.md", _RESULTS / "lens.json"
 Row = dict[str, Any]
 
 
-def distorted_frames(shot: Shot, lens: pycolmap.Camera) -> Iterator[factorsfm.Frame]:
-    """The frames as a lens with radial distortion would have seen them."""
-    x, y = np.meshgrid(np.arange(lens.width), np.arange(lens.height))
-    uv = normalized_from_pixels(lens, np.stack([x.ravel(), y.ravel()], 1).astype(np.float64))
-    source = pixels_from_normalized(shot.camera, uv).reshape(lens.height, lens.width, 2).astype(np.float32)
-    for frame in shot.frames():
-        image = cv2.remap(frame.image, source, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-        yield replace(frame, image=np.asarray(image, np.uint8))
+class Distorted:
+    """A shot as a lens with radial distortion would have seen it: its frames, and its masks as a mask prior."""
+
+    def __init__(self, shot: Shot, lens: pycolmap.Camera) -> None:
+        x, y = np.meshgrid(np.arange(lens.width), np.arange(lens.height))
+        uv = normalized_from_pixels(lens, np.stack([x.ravel(), y.ravel()], 1).astype(np.float64))
+        self._source = pixels_from_normalized(shot.camera, uv).reshape(*x.shape, 2).astype(np.float32)
+        self._shot = shot
+        self._masks = factorsfm.MaskFolder(shot.masks) if shot.masks is not None else None
+
+    def __iter__(self) -> Iterator[factorsfm.Frame]:
+        for frame in self._shot.frames():
+            yield replace(frame, image=np.asarray(self._seen(frame.image, cv2.INTER_CUBIC), np.uint8))
+
+    def __call__(self, frame: factorsfm.Frame) -> NDArray[np.bool_] | None:
+        mask = self._masks(frame) if self._masks is not None else None
+        return None if mask is None else self._seen(mask.astype(np.uint8), cv2.INTER_NEAREST) > 0
+
+    def _seen(self, image: NDArray[np.uint8], interpolation: int) -> cv2.typing.MatLike:
+        return cv2.remap(image, self._source, None, interpolation, borderMode=cv2.BORDER_REPLICATE)
 
 
 def true_lens(shot: Shot, k1: float, k2: float) -> pycolmap.Camera:
@@ -120,9 +132,9 @@ def main() -> None:
 
 def shot_row(shot: Shot, depth: factorsfm.DepthModel) -> Row:
     """The shot with its lens known, and without."""
-    known = factorsfm.reconstruct(shot.source, camera=shot.camera, depth=depth)
+    known = factorsfm.reconstruct(shot.source, camera=shot.camera, depth=depth, masks=shot.masks)
     begin = time.perf_counter()
-    result = factorsfm.reconstruct(shot.source, depth=depth)
+    result = factorsfm.reconstruct(shot.source, depth=depth, masks=shot.masks)
     seconds = time.perf_counter() - begin
     focal = f"{shot.camera.mean_focal_length():.0f}"
     return {"parallax": f"{known.parallax:.3f}", "true f": focal, "AUC, lens known": pose_auc(known, shot)} | {
@@ -134,9 +146,8 @@ def distorted_row(shot: Shot, depth: factorsfm.DepthModel, k1: float, k2: float,
     """The shot as a lens with this distortion would have seen it, without its lens, or with its focal length alone."""
     truth = true_lens(shot, k1, k2)
     camera = with_focal(shot.camera, truth.mean_focal_length()) if held else None
-    result = factorsfm.reconstruct(
-        distorted_frames(shot, truth), camera=camera, depth=depth, lens="radial" if held else "auto"
-    )
+    seen = Distorted(shot, truth)
+    result = factorsfm.reconstruct(seen, camera=camera, depth=depth, masks=seen, lens="radial" if held else "auto")
     found, off = result.camera, difference_px(result.camera, truth)
     k = found.params[3:] if found.model_name == "RADIAL" else (0.0, 0.0)
     return _found(result, shot, truth) | {
@@ -168,8 +179,9 @@ def report(rows: dict[str, Row]) -> str:
         [
             "# Unknown lenses", "",
             "`python -m benchmarks.lens --data FOLDER --models FOLDER`, and the real sets with `--shots NAME ...`", "",
-            "Prior: TCMonoDepth. AUC: relative poses at 1 / 5 degrees. std: of the focal length. Not determined: not "
-            "certain enough to count as an estimate; without a std the first guess is kept.", "",
+            "Prior: TCMonoDepth; masks where the shot has them. AUC: relative poses at 1 / 5 degrees. std: of the "
+            "focal length. Not determined: not certain enough to count as an estimate; without a std the first guess "
+            "is kept.", "",
             *_table("shot", plain),
             "The same seen through lenses with distortion k1, k2, and unknown; the focal length is a little longer, so "
             "that the image is full. px: between the pixels of the same ray in the true and in the found lens, over "
