@@ -18,6 +18,7 @@ from factorsfm.images import MappedImage
 _LEAST_AGREEMENT = 0.25  # rank correlation; of networks it is about 0.95, of noise in each pixel of 40 % still 0.35
 _LEAST_PAIRS = 3  # of keyframes
 _LEAST_TRACKS = 20  # that both see and have a depth for
+_LEAST_SPREAD = 0.05  # of the depths, half of them, over their median: those of a wall have no order to contradict
 
 
 def inconsistency(keyframes: Sequence[MappedImage]) -> str:
@@ -33,7 +34,7 @@ def inconsistency(keyframes: Sequence[MappedImage]) -> str:
 
 
 def _agreement(a: MappedImage, b: MappedImage) -> float | None:
-    """Rank correlation of what two depth maps say of the same points; None where these are too few."""
+    """Rank correlation of what two depth maps say of the same points; None where these are too few, or a wall."""
     assert a.tracks.depth is not None
     assert b.tracks.depth is not None
     _, in_a, in_b = np.intersect1d(a.tracks.ids, b.tracks.ids, assume_unique=True, return_indices=True)
@@ -41,7 +42,14 @@ def _agreement(a: MappedImage, b: MappedImage) -> float | None:
     if both.sum() < _LEAST_TRACKS:
         return None
     said = a.tracks.depth.inverse_depth[in_a][both], b.tracks.depth.inverse_depth[in_b][both]
+    if any(_spread(values) < _LEAST_SPREAD for values in said):
+        return None
     return float(np.corrcoef(_ranks(said[0]), _ranks(said[1]))[0, 1])
+
+
+def _spread(values: NDArray[np.float64]) -> float:
+    low, median, high = np.quantile(values, [0.25, 0.5, 0.75])
+    return float((high - low) / median)
 
 
 def _ranks(values: NDArray[np.float64]) -> NDArray[np.intp]:

@@ -40,6 +40,16 @@ def test_one_bad_map_is_an_accident():
     assert inconsistency(keyframes(6, shuffled=[3])[1]) == ""  # it spoils two of five pairs
 
 
+@pytest.mark.parametrize(("noise", "told"), [(0.01, False), (0.3, True)])
+def test_a_wall_has_no_order_of_depths_to_contradict(noise, told):
+    _, images = keyframes()
+    for k, image in enumerate(images):
+        said = image.tracks.depth.inverse_depth
+        wall = 2.0 * (1.0 + noise * np.random.default_rng(k).standard_normal(len(said)))
+        image.tracks = replace(image.tracks, depth=replace(image.tracks.depth, inverse_depth=wall))
+    assert (inconsistency(images) != "") == told
+
+
 def test_three_pairs_are_needed_and_tracks_that_both_see():
     _, images = keyframes(shuffled=range(5))
     assert inconsistency(images[:3]) == ""
