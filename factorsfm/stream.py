@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
@@ -45,7 +46,8 @@ from factorsfm.result import assemble
 from factorsfm.snapshot import read_snapshot, write_snapshot
 from factorsfm.threads import OneThreadEach
 from factorsfm.tracks.colors import TrackColors
-from factorsfm.tracks.flow import BLANK_TEXTURE, FlowTracker
+from factorsfm.tracks.flow import FlowTracker
+from factorsfm.tracks.grey import BLANK_TEXTURE
 from factorsfm.view_finder import ViewFinder
 
 logger = logging.getLogger(__name__)
@@ -346,7 +348,7 @@ class Stream(Closing):
     def _follow_focal(self, mapper: Mapper) -> bool:
         """Take over the focal length with which the mapper normalises; whether it is another one."""
         assert self.camera is not None
-        if np.isclose(mapper.focal, self.camera.mean_focal_length(), rtol=1e-12, atol=0.0):
+        if math.isclose(mapper.focal, self.camera.mean_focal_length(), rel_tol=1e-12):
             return False
         self.camera = with_focal(self.camera, mapper.focal)
         return True

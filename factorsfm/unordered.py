@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from factorsfm.errors import InputError
 from factorsfm.frames import Frame, bgr_image, list_images, read_frames, read_image
-from factorsfm.tracks.flow import BLANK_TEXTURE, image_texture
+from factorsfm.tracks.grey import BLANK_TEXTURE, image_texture
 
 logger = logging.getLogger(__name__)
 

@@ -11,26 +11,24 @@ from __future__ import annotations
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.options import TrackerOptions
+from factorsfm.tracks.grey import GreyFrame, exposed_as
 from factorsfm.tracks.local_motion import LocalMotion
-from factorsfm.tracks.patches import Array, BirthPatches, Image, in_parts
+from factorsfm.tracks.patches import Array, BirthPatches, in_parts
 
 _STATE = ("_texture", "_frame", "_replenished", "_next_id", "_ids", "_xy", "_velocity", "_ended", "_avoided")
-BLANK_TEXTURE = 0.2  # grey levels
 _MOST_ENDED = 3000  # tracks that are remembered
 _REVIVAL_REACH = 2.0  # times that of a re-alignment: where a track should be is known less well
 _SCOUTS = 64  # tracks that tell how the camera's motion has changed
 _FIT_STEPS, _FIT_RIDGE = 5, 1e-4
 _SURPRISE_PX, _SURPRISE_RATIO = 0.5, 3.0  # distance from the predicted place; and times that of the others
 _GRID = 24  # cells along the longer image side, from which new corners are taken in turn
-_LEVELS = np.arange(256)
-_EXPOSURE_CHANGE = 4.0  # mean change of the grey levels between frames, with which it is made good
 _CHECK_INTERVAL = 2  # frames: the way back of an alignment is tried in turn
 _REPLENISH_INTERVAL, _FEW = 3, 0.7  # frames between looking for corners, unless so small a share of the tracks is left
 _MOST = 0.5  # share of the tracks that are where they should be, or all are looked for from scratch
@@ -56,23 +54,12 @@ class TrackedFrame:
     texture: float
 
 
-class _Frame(NamedTuple):
-    full: Image
-    half: Image
-    levels: NDArray[np.float32]  # how often each grey level occurs in `half`
-
-    @classmethod
-    def of(cls, grey: Image) -> _Frame:
-        half = _halved(grey)
-        return cls(grey, half, cv2.calcHist([half], [0], None, [256], [0, 256]).ravel())
-
-
 class FlowTracker:
     """Follows image points through a video, one frame at a time, in bounded memory."""
 
     def __init__(self, options: TrackerOptions) -> None:
         self.options = options
-        self._previous: _Frame | None = None
+        self._previous: GreyFrame | None = None
         self._texture = 0.0  # of the previous image
         self._frame = 0
         self._replenished = 0  # the frame in which tracks were started last
@@ -103,8 +90,8 @@ class FlowTracker:
             expected: ended tracks that are in view again, see `revive`; they come before new ones.
         """
         grey = np.ascontiguousarray(image) if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-        frame = _Frame.of(grey)
-        texture = _texture(frame.half)
+        frame = GreyFrame.of(grey)
+        texture = frame.texture
         if texture < _BLANK_SHARE * self._texture:  # the tracks wait for the next frame that shows something
             return TrackedFrame(np.zeros(0, np.int64), np.zeros((0, 2)), 0, 0, texture)
         before = len(self._ids)
@@ -201,7 +188,7 @@ class FlowTracker:
         for name in _STATE:
             setattr(self, name, state[name])
         previous = state["previous"]
-        self._previous = _Frame.of(previous) if previous is not None else None
+        self._previous = GreyFrame.of(previous) if previous is not None else None
         self._patches.restore(state["patches"])
         self._ended_patches.restore(state["ended"])
 
@@ -211,10 +198,10 @@ class FlowTracker:
         self._velocity = self._velocity[index]
         self._patches.keep(index)
 
-    def _step(self, previous: _Frame, frame: _Frame, mask: NDArray[np.bool_] | None) -> None:
+    def _step(self, previous: GreyFrame, frame: GreyFrame, mask: NDArray[np.bool_] | None) -> None:
         """Align the patches where their tracks should be; search in the frame before for those that are not there."""
         o, old, n, grey = self.options, self._xy, len(self._ids), frame.full
-        previous = _exposed_as(previous, frame)
+        previous = exposed_as(previous, frame)
         start = self._predicted(previous, frame)
         checked = (self._ids + self._frame) % _CHECK_INTERVAL == 0
         new, ok = self._patches.align(
@@ -246,7 +233,7 @@ class FlowTracker:
         """How fast points should be that were not followed into this frame: as fast as their neighbours."""
         return np.zeros_like(xy) if self._motion is None else self._motion.at(xy)
 
-    def _predicted(self, previous: _Frame, frame: _Frame) -> Array:
+    def _predicted(self, previous: GreyFrame, frame: GreyFrame) -> Array:
         """Where tracks should be: as fast as before, and with the camera's change of motion, which a few tell."""
         predicted = self._xy + self._velocity
         scouts = np.linspace(0, len(predicted) - 1, min(len(predicted), _SCOUTS)).astype(int)
@@ -259,7 +246,7 @@ class FlowTracker:
         return np.asarray(predicted + cause @ change, np.float32)
 
     def _roughly(
-        self, previous: _Frame, frame: _Frame, xy: Array, start: Array | None = None
+        self, previous: GreyFrame, frame: GreyFrame, xy: Array, start: Array | None = None
     ) -> tuple[Array, NDArray[np.bool_]]:
         """Flow of points in the images of half the size, and where there is any: near `start`, or anywhere."""
         first = None if start is None else (start - 0.5) / 2
@@ -271,7 +258,7 @@ class FlowTracker:
         return 2 * found + 0.5, status[:, 0] == 1
 
     def _search(
-        self, previous: _Frame, frame: _Frame, xy: Array, start: Array | None
+        self, previous: GreyFrame, frame: GreyFrame, xy: Array, start: Array | None
     ) -> tuple[Array, NDArray[np.bool_]]:
         """Flow of points, and whether the way back, tried from where it should end, stays there.
 
@@ -296,7 +283,7 @@ class FlowTracker:
 
         return in_parts(part, len(xy), len(xy), self._pool) if len(xy) else (xy, np.zeros(0, bool))
 
-    def _replenish(self, frame: _Frame, mask: NDArray[np.bool_] | None) -> int:
+    def _replenish(self, frame: GreyFrame, mask: NDArray[np.bool_] | None) -> int:
         """Start tracks where the image is not covered, strongest corners first in every cell."""
         o = self.options
         room = o.max_tracks - len(self._ids)
@@ -350,36 +337,6 @@ def _robust_fit(cause: NDArray[np.float64], effect: Array) -> NDArray[np.float64
         error = np.linalg.norm(cause @ solution - effect, axis=1)
         weight = 1.0 / (1.0 + (error / max(float(np.sort(error)[rows // 2]), _SURPRISE_PX)) ** 2)
     return solution
-
-
-def _halved(grey: Image) -> Image:
-    h, w = grey.shape
-    return np.asarray(
-        cv2.resize(grey[: h // 2 * 2, : w // 2 * 2], (w // 2, h // 2), interpolation=cv2.INTER_AREA), np.uint8
-    )
-
-
-def _exposed_as(previous: _Frame, frame: _Frame) -> _Frame:
-    """The frame before with the exposure of the present one: grey levels that have the same rank."""
-    counts, target = previous.levels, frame.levels
-    levels = np.interp(np.cumsum(counts) / counts.sum(), np.cumsum(target) / target.sum(), _LEVELS)
-    if counts @ np.abs(levels - _LEVELS) < _EXPOSURE_CHANGE * counts.sum():
-        return previous
-    table = np.rint(levels).astype(np.uint8)
-    full, half = (np.asarray(cv2.LUT(image, table), np.uint8) for image in (previous.full, previous.half))
-    return _Frame(full, half, target)
-
-
-def image_texture(grey: Image) -> float:
-    """Texture of a (h, w) image as in `TrackedFrame`; below `BLANK_TEXTURE` it is black, white or out of focus."""
-    return _texture(_halved(grey))
-
-
-def _texture(half: Image) -> float:
-    """Of the image of half the size, in grey levels of the whole."""
-    # In floats: the rounding of 8 bits alone would look like texture.
-    edges = cv2.Laplacian(cv2.GaussianBlur(half.astype(np.float32), (0, 0), 0.7), cv2.CV_32F)
-    return float(cv2.meanStdDev(edges)[1][0, 0]) / 4
 
 
 def _inside(xy: NDArray[np.floating[Any]], shape: tuple[int, ...], border: int) -> NDArray[np.bool_]:
