@@ -15,14 +15,18 @@ from benchmarks.store import Record
 POSE = ("ATE 0.2 cm", "ATE 2 cm", "T-RPE 0.1 cm", "T-RPE 0.5 cm", "R-RPE 0.02°", "R-RPE 0.1°")
 
 
+def _others(shot: str, variant: str, prior: str) -> list[tuple[str, str, str, str]]:
+    """Against what `default` is measured: shot, variant, method and prior."""
+    return [(shot, variant, "geometry", "none"), (shot, variant, "paper", prior)]
+
+
 def no_harm(experiments: Mapping[str, Records]) -> list[str]:
     """`default` against the better of `geometry` and `paper`, column by column."""
     rows: list[list[Any]] = []
     for name, records in experiments.items():
         found = {(r.cell.shot, r.cell.variant, r.cell.method, r.cell.prior): r for r in records}
         for (shot, variant, method, prior), record in found.items():
-            others = [(shot, variant, "geometry", "none"), (shot, variant, "paper", prior)]
-            rivals = [pose_aucs([found[key]]) for key in others if key in found]
+            rivals = [pose_aucs([found[key]]) for key in _others(shot, variant, prior) if key in found]
             if method == "default" and name not in ("edge", "luck") and rivals:
                 differences = np.array(pose_aucs([record])) - np.max(rivals, axis=0)
                 rows.append([name, shot, variant, prior, *(f"{d:+.1f}" for d in differences), float(differences.min())])
@@ -47,8 +51,8 @@ def luck(experiments: Mapping[str, Records]) -> list[str]:
         draws.setdefault(key, {})[draw] = pose_aucs([record])
     rows: list[list[Any]] = []
     for (shot, variant, method, prior), found in draws.items():
-        others = [(shot, variant, "geometry", "none"), (shot, variant, "paper", prior)]
-        rivals = [np.array(list(draws[key].values())) for key in others if len(draws.get(key, ())) > 1]
+        others = (draws.get(key, {}) for key in _others(shot, variant, prior))
+        rivals = [np.array(list(other.values())) for other in others if len(other) > 1]
         if method == "default" and len(found) > 1 and rivals:
             ours = np.array(list(found.values()))
             differences = ours.mean(0) - np.max([rival.mean(0) for rival in rivals], axis=0)

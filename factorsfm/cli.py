@@ -15,7 +15,7 @@ from typing import Any, NoReturn, TextIO, get_args
 
 from factorsfm import api, demo, extension, stream_command
 from factorsfm.batch import command as batch_command
-from factorsfm.camera import read_camera
+from factorsfm.camera import open_camera
 from factorsfm.errors import FactorsfmError, ReconstructionError
 from factorsfm.export import command as export_command
 from factorsfm.export.folder import check_directory, write_failure, write_folder
@@ -80,7 +80,7 @@ def _run(arguments: argparse.Namespace, progress: _Progress) -> str:
 
 def _reconstruct(arguments: argparse.Namespace, progress: _Progress) -> str:
     check_directory(arguments.output)
-    camera = read_camera(arguments.camera) if arguments.camera else None
+    camera = open_camera(arguments.camera)
     frames = parse_range(arguments.frames) if arguments.frames is not None else None
     start = time.perf_counter()
     try:

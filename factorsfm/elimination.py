@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,7 @@ _CHUNK = 512  # points eliminated together
 _ROWS = 16  # of a block worked on at once: they stay in the processor's cache
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Term:
     """Linearised residuals, the observations along the last axis (contiguous, so that numpy runs at full speed).
 
@@ -41,7 +42,7 @@ class Term:
     point: Index
     errors: TrackErrors | None = None
 
-    @property
+    @cached_property
     def decorrelated_by_point(self) -> Array:
         return self.by_point if self.errors is None else self.errors.decorrelated(self.by_point)
 
@@ -156,13 +157,13 @@ class Elimination:
     def cross_blocks(self, normal: Normal) -> list[Block]:
         """Camera-point blocks of the information matrix, dense over the columns of each chunk."""
         blocks = []
-        by_points = [t.decorrelated_by_point for t in normal.terms]
         for flat, columns, span in self._chunk_indices(normal.terms):
             n = span.stop - span.start
             cross = np.zeros(len(columns) * 3 * n)
-            for t, by_point, (position, single) in zip(normal.terms, by_points, flat, strict=True):
+            for t, (position, single) in zip(normal.terms, flat, strict=True):
                 rows = slice(*np.searchsorted(t.point, [span.start, span.stop]))
-                values = np.einsum("cdm,pdm->cpm", t.by_camera[:, :, rows], by_point[:, :, rows]).ravel()
+                by_point = t.decorrelated_by_point[:, :, rows]
+                values = np.einsum("cdm,pdm->cpm", t.by_camera[:, :, rows], by_point).ravel()
                 if single:
                     cross[position] += values
                 else:

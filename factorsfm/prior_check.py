@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from factorsfm.images import MappedImage
 
-_LEAST_AGREEMENT = 0.25  # rank correlation; of networks it is about 0.95, of noise in each pixel of 40 % still 0.35
+_LEAST_AGREEMENT = 0.25  # rank correlation; of networks it is about 0.95, of noise in each pixel of 40 % still 0.33
 _LEAST_PAIRS = 3  # of keyframes
 _LEAST_TRACKS = 20  # that both see and have a depth for
 _LEAST_SPREAD = 0.05  # of the depths, half of them, over their median: those of a wall have no order to contradict

@@ -16,7 +16,7 @@ from types import FrameType
 from typing import Any
 
 from factorsfm.api import check_matched, input_options
-from factorsfm.camera import camera_to_json, read_camera
+from factorsfm.camera import camera_to_json, open_camera, read_camera
 from factorsfm.episode import Episode, ShotResult
 from factorsfm.errors import InputError, ReconstructionError
 from factorsfm.export.folder import check_directory, write_failure, write_folder
@@ -94,7 +94,7 @@ def run(arguments: argparse.Namespace, progress: Progress, show: Show) -> str:
     """
     _check(arguments)
     begin = time.perf_counter()
-    camera = read_camera(arguments.camera) if arguments.camera else None
+    camera = open_camera(arguments.camera)
     frames = parse_range(arguments.frames) if arguments.frames is not None else None
     raw = RawFormat.parse(arguments.raw) if arguments.raw else None
     options = replace(Options.preset_named(arguments.preset), lens=arguments.lens)

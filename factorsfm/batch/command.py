@@ -14,7 +14,7 @@ from factorsfm.batch.crew import Crew, open_crew
 from factorsfm.batch.index import Entry, Index, shots_known
 from factorsfm.batch.plan import Job, Method, Video, find_videos, plan_jobs
 from factorsfm.batch.worker import Progress, find_shots_of, reconstruct_shot
-from factorsfm.camera import read_camera
+from factorsfm.camera import open_camera
 from factorsfm.errors import FactorsfmError, InputError, ReconstructionError
 from factorsfm.export.folder import check_directory, is_earlier_result, write_failure
 from factorsfm.options import Options
@@ -97,7 +97,7 @@ def _method(arguments: argparse.Namespace, *, several: bool) -> Method:
         open_depth(depth, arguments.depth_kind)
     if not (several and masks and Path(masks).is_dir()):
         open_masks(masks)
-    camera = read_camera(arguments.camera) if arguments.camera else None
+    camera = open_camera(arguments.camera)
     return Method(camera, depth, arguments.depth_kind, masks, arguments.preset, arguments.lens)
 
 
