@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.evaluation.alignment import nearest_rotation
 from factorsfm.given_covariance import given_covariance
 from factorsfm.graph_process import GraphProcess
 from factorsfm.images import ImageTracks, MappedImage, median_flow, renormalize, shared_tracks
@@ -433,5 +434,7 @@ class Mapper:
             if image.registered:
                 turn, shift = image.pose
                 relative = turn @ before[0].T
-                image.rotation = relative @ rotation
+                # Rotations that stem from each other are alike in how far they are none: here it would be three times
+                # as far, at every keyframe.
+                image.rotation = nearest_rotation(relative @ rotation)
                 image.translation = relative @ (translation - before[1]) + shift

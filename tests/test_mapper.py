@@ -67,3 +67,14 @@ def test_a_lost_image_is_registered_on_tracks_that_no_keyframe_saw():
     mapper.close()
     assert image.status is FrameStatus.REGISTERED
     np.testing.assert_allclose(image.translation, problem.truth.translation[10], atol=1e-6)
+
+
+def test_rotations_stay_rotations_however_long_the_shot():
+    problem = make_problem("truck", frames=160, points=300, parallax=0.9)
+    mapper = Mapper(GraphProcess(), problem.focal, 640, Options.preset_named("geometry"), has_prior=False)
+    for k in range(problem.frames):
+        mapper.add(ImageTracks(k, *problem.of_frame(k)), lambda: None)
+    mapper.close()
+    assert len(mapper.keyframes) > 20
+    rotation = np.array([image.rotation for image in mapper.images])
+    np.testing.assert_allclose(rotation @ rotation.transpose(0, 2, 1), np.tile(np.eye(3), (problem.frames, 1, 1)), atol=1e-12)
