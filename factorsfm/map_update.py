@@ -57,7 +57,6 @@ class MapUpdate:
         committed, reason: whether the map may take it over, and why not.
         ids, points: moved and new points; removed: points that no longer hold.
         poses, affines, covariances: of the keyframes that moved, by position.
-        outliers: tracks of the new keyframe whose point is elsewhere.
         focal: a better focal length (pixels), None where it stays as it is.
         burn_ins: tracks of what is laid over the images.
         mirrored: see `UpdateResult`.
@@ -74,7 +73,6 @@ class MapUpdate:
     poses: dict[int, tuple[Array, Array]] = field(default_factory=dict)
     affines: dict[int, tuple[float, float]] = field(default_factory=dict)
     covariances: dict[int, Array] = field(default_factory=dict)
-    outliers: Index = field(default_factory=lambda: np.zeros(0, np.int64))
     focal: float | None = None
     burn_ins: Index = field(default_factory=lambda: np.zeros(0, np.int64))
     mirrored: bool = False
@@ -343,10 +341,9 @@ def _judged(
     limit = _GROSS * max(copy.options.inlier_px, 5.0 * float(np.median(errors)))
     typical = np.sqrt(o.mean_by_point(errors**2))
     good = (state.inverse_distance > _FARTHEST) & (typical < limit)
-    newest = (o.frame == len(window) - 1) & (errors > limit)
     return MapUpdate(
         window[-1].tracks.position, window[-1].tracks.depth, True, result.reason,
-        ids[good], unit * state.points[good], ids[~good], poses, affines, covariances, ids[o.point[newest]], focal,
+        ids[good], unit * state.points[good], ids[~good], poses, affines, covariances, focal,
     )  # fmt: skip
 
 

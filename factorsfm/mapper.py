@@ -61,8 +61,7 @@ class Mapper:
         self._refine_focal = options.refine_focal_length
         self.images: list[MappedImage] = []
         self.keyframes: list[int] = []
-        self.outliers = np.zeros(0, np.int64)  # tracks that the last image showed to be wrong
-        self.burn_ins = np.zeros(0, np.int64)  # tracks that it showed to be laid over the image
+        self.burn_ins = np.zeros(0, np.int64)  # tracks that the last image showed to be laid over the image
         self.new_points = 0  # that came with the last image
         self.parallax = 0.0  # largest so far
         self.note = ""  # what became of the map with the last image, where that is out of the ordinary
@@ -131,7 +130,7 @@ class Mapper:
         if self._advanced == len(self.images):
             return
         self._advanced = len(self.images)
-        self.outliers = self.burn_ins = np.zeros(0, np.int64)
+        self.burn_ins = np.zeros(0, np.int64)
         self.new_points = 0
         self.note, self.starts_anew = "", False
         if self._update is not None and len(self.images) >= self._due:
@@ -381,7 +380,7 @@ class Mapper:
             return
         self.keyframes.append(update.position)
         before = image.pose
-        self.new_points = int((~self.points.contains(update.ids)).sum())
+        self.new_points += int((~self.points.contains(update.ids)).sum())
         self.points.set(update.ids, update.points)
         self.points.remove(update.removed)
         for position, pose in update.poses.items():
@@ -390,7 +389,6 @@ class Mapper:
             self.images[position].covariance = covariance
         for position, affine in update.affines.items():
             self.images[position].affine = affine
-        self.outliers = update.outliers
         self.burn_ins = np.union1d(self.burn_ins, update.burn_ins)
         self._carry(update.position, before)
         if update.focal is not None:

@@ -151,7 +151,6 @@ class Stream(Closing):
         self.frames.append(SeenFrame(frame.index, frame.name, frame.timestamp, tracked.texture))
         self._pixels.append(pixels)
         self._thumbnails.add(frame.image)
-        self._tracker.drop(mapper.outliers)
         if len(mapper.burn_ins):
             self._tracker.avoid(mapper.burn_ins)
             self._forget(mapper, mapper.burn_ins)

@@ -176,7 +176,7 @@ def test_ids_are_never_used_again_and_the_counts_agree():
     tracker = FlowTracker(OPTIONS)
     ever: set[int] = set()
     before: set[int] = set()
-    for k, image in enumerate(rendered("rotation").images):
+    for image in rendered("rotation").images:
         frame = tracker.track(image)
         now = set(frame.ids.tolist())
         assert len(now) == len(frame.ids) <= OPTIONS.max_tracks
@@ -184,10 +184,8 @@ def test_ids_are_never_used_again_and_the_counts_agree():
         assert len(now - before) == frame.born
         assert len(before - now) == frame.lost
         ever |= now
-        tracker.drop(frame.ids[:20])  # as the mapper may; dropped tracks do not come back
-        before = now - set(frame.ids[:20].tolist())
-        assert set(tracker._ids.tolist()) == before, k
-    assert len(ever) > OPTIONS.max_tracks + 100
+        before = now
+    assert len(ever) > OPTIONS.max_tracks + 20
 
 
 def test_no_track_starts_in_or_enters_a_mask():
@@ -259,10 +257,13 @@ def test_memory_is_bounded():
     assert max(sizes) <= images[0].shape[0] * images[0].shape[1] + (OPTIONS.max_tracks + 3000) * per_track
 
 
-def test_an_ended_track_is_taken_up_again_where_its_patch_is():
+def test_a_track_that_left_the_view_a_while_ago_is_taken_up_again_where_its_patch_is():
     shot = rendered("truck")
     tracker = FlowTracker(OPTIONS)
-    for image in [*shot.images, *shot.images[-2::-1]]:
+    for image in shot.images:
+        tracker.track(image)
+    assert len(tracker.ended) == 0  # the camera may go on
+    for image in [*itertools.repeat(shot.images[-1], 48), *shot.images[-2::-1]]:
         last = tracker.track(image)
     born = track_all(shot.images[:1])[0]  # the same tracks, in the first image
     gone = np.intersect1d(born.ids, tracker.ended)
@@ -276,9 +277,25 @@ def test_an_ended_track_is_taken_up_again_where_its_patch_is():
     after = tracker.track(shot.images[0])
     _, here, there = np.intersect1d(after.ids, revived, return_indices=True)
     error = np.linalg.norm(after.xy[here] - born.xy[np.searchsorted(born.ids, revived[there])], axis=1)
-    assert np.median(error) < 0.2  # they are those that were hard to follow
+    assert np.median(error) < 0.2
     assert not np.isin(revived, tracker.ended).any()
     assert (np.diff(after.ids) > 0).all()
+
+
+def test_tracks_that_are_lost_alone_are_forgotten_and_together_they_can_be_taken_up_at_once():
+    image = rendered("truck").images[0]
+    covered = {share: image.copy() for share in (0.2, 0.8)}
+    for share, other in covered.items():
+        width = round(share * image.shape[1])
+        other[:, :width] = np.random.default_rng(0).integers(0, 255, (image.shape[0], width, 3), np.uint8)
+    for share, other in covered.items():
+        tracker = FlowTracker(OPTIONS)
+        before = tracker.track(image)
+        after = tracker.track(other)
+        lost = np.setdiff1d(before.ids, after.ids)
+        assert 0.5 * share < len(lost) / len(before.ids) < 1.2 * share
+        assert np.isin(tracker.ended, lost).all()
+        assert len(tracker.ended) > 0.95 * len(lost) if share > 0.5 else not len(tracker.ended)
 
 
 @pytest.mark.parametrize("name", ["d01_livingroom_dolly_in", "d04_warehouse_crane"])

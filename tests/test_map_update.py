@@ -53,7 +53,7 @@ def test_the_first_keyframe_is_the_world():
     problem, images, _ = handheld(guided=[0], scale=1.3, shift=0.1)
     update = update_map(copy_of(problem, images[:1], map_of(problem.points)), graph := Recorder())
     assert (update.committed, update.reason, update.position) == (True, "the first keyframe", 0)
-    assert (len(update.ids), len(update.points), len(update.removed), len(update.outliers)) == (0, 0, 0, 0)
+    assert (len(update.ids), len(update.points), len(update.removed)) == (0, 0, 0)
     assert (update.poses, update.covariances) == ({}, {})
     assert update.affines[0] == pytest.approx((1.3, 0.1), abs=1e-3)
     assert update.depth is images[0].tracks.depth
@@ -266,12 +266,11 @@ def test_a_track_of_one_keyframe_is_no_point_yet():
 # --- what does not fit ------------------------------------------------------------------------------------------
 
 
-def test_an_observation_that_is_elsewhere_is_an_outlier_of_the_new_keyframe():
+def test_an_observation_that_is_elsewhere_takes_no_point_away():
     problem, images, points = handheld()
     images[5].tracks.xy[[3, 17], 0] += 25 / problem.focal
-    images[2].tracks.xy[8, 0] += 25 / problem.focal  # in an old keyframe: no news
+    images[2].tracks.xy[8, 0] += 25 / problem.focal
     update = update_map(copy_of(problem, images, map_of(points)), FactorGraph())
-    np.testing.assert_array_equal(update.outliers, [3, 17])
     assert len(update.removed) == 0  # the other views hold the points
 
 
@@ -292,7 +291,7 @@ def test_a_point_that_holds_nowhere_is_removed():
 def test_nothing_is_removed_from_a_sound_map():
     problem, images, points = handheld(noise_px=0.3)
     update = update_map(copy_of(problem, images, map_of(points)), FactorGraph())
-    assert (len(update.removed), len(update.outliers)) == (0, 0)
+    assert len(update.removed) == 0
 
 
 # --- the depth of the keyframe ----------------------------------------------------------------------------------
@@ -371,7 +370,7 @@ def test_an_update_that_is_rolled_back_changes_nothing():
     assert "behind the camera" in update.reason or "indeterminate" in update.reason
     assert update.position == 5
     assert update.depth is not None  # it was read, and may serve
-    assert (len(update.ids), len(update.removed), len(update.outliers)) == (0, 0, 0)
+    assert (len(update.ids), len(update.removed)) == (0, 0)
     assert (update.poses, update.affines, update.covariances) == ({}, {}, {})
     images[5] = sound
     results = [update_map(copy_of(problem, images, map_of(points)), g) for g in (graph, untouched)]

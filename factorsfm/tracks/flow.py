@@ -22,8 +22,11 @@ from factorsfm.tracks.grey import GreyFrame, exposed_as
 from factorsfm.tracks.local_motion import LocalMotion
 from factorsfm.tracks.patches import Array, BirthPatches, in_parts
 
-_STATE = ("_texture", "_frame", "_replenished", "_next_id", "_ids", "_xy", "_velocity", "_ended", "_avoided")
+_STATE = (
+    "_texture", "_frame", "_replenished", "_next_id", "_ids", "_xy", "_velocity", "_ended", "_away_until", "_avoided",
+)  # fmt: skip
 _MOST_ENDED = 3000  # tracks that are remembered
+_AWAY = 48  # frames: only of a camera that comes back tracks are taken up that have left the view
 _REVIVAL_REACH = 2.0  # times that of a re-alignment: where a track should be is known less well
 _SCOUTS = 64  # tracks that tell how the camera's motion has changed
 _FIT_STEPS, _FIT_RIDGE = 5, 1e-4
@@ -71,8 +74,9 @@ class FlowTracker:
         self._avoided = np.zeros((0, 2), np.float32)  # places where no track may start
         self._patches = BirthPatches(options.window_px)
         self._window = (options.window_px, options.window_px)
-        self._just_ended: list[tuple[NDArray[np.int64], BirthPatches]] = []
+        self._just_ended: list[tuple[NDArray[np.int64], NDArray[np.int64], BirthPatches]] = []
         self._ended = np.zeros(0, np.int64)
+        self._away_until = np.zeros(0, np.int64)  # frame from which an ended track can be taken up again
         self._ended_patches = BirthPatches(options.window_px)
         self._pool = ThreadPoolExecutor(2)
 
@@ -106,11 +110,6 @@ class FlowTracker:
         self._patches.warp_ahead(self._pool)
         return TrackedFrame(self._ids.copy(), self._xy.astype(np.float64), lost, born, texture)
 
-    def drop(self, ids: NDArray[np.int64]) -> None:
-        """End tracks that the mapper found to be outliers."""
-        if len(ids):
-            self._keep(~np.isin(self._ids, ids))
-
     def avoid(self, ids: NDArray[np.int64]) -> None:
         """End tracks of what is laid over the images, and start none in these places again."""
         gone = np.isin(self._ids, ids)
@@ -120,9 +119,9 @@ class FlowTracker:
 
     @property
     def ended(self) -> NDArray[np.int64]:
-        """Tracks that have ended and can be taken up again."""
+        """Tracks that can be taken up again: they were lost together with most others, or left the view a while ago."""
         self._gather_ended()
-        return self._ended
+        return self._ended[self._away_until <= self._frame]
 
     def revive(
         self, image: NDArray[np.uint8], ids: NDArray[np.int64], xy: NDArray[np.float64]
@@ -157,24 +156,28 @@ class FlowTracker:
         self._keep(np.argsort(self._ids))
         rest = np.ones(len(self._ended), bool)
         rest[rows] = False
-        self._ended = self._ended[rest]
-        self._ended_patches.keep(rest)
+        self._keep_ended(rest)
         return np.asarray(revived), found.astype(np.float64)
 
-    def _end(self, rows: NDArray[np.intp]) -> None:
-        """Put tracks aside."""
+    def _end(self, rows: NDArray[np.intp], away_until: int) -> None:
+        """Put tracks aside, not to be taken up before a frame."""
         if len(rows):
-            self._just_ended.append((self._ids[rows], self._patches.take(rows)))
+            self._just_ended.append((self._ids[rows], np.full(len(rows), away_until), self._patches.take(rows)))
 
     def _gather_ended(self) -> None:
         """Join what was put aside lately with the rest; the oldest are forgotten where there are too many."""
-        for ids, patches in self._just_ended:
+        for ids, away_until, patches in self._just_ended:
             self._ended = np.r_[self._ended, ids]
+            self._away_until = np.r_[self._away_until, away_until]
             self._ended_patches.append(patches)
         self._just_ended.clear()
         if len(self._ended) > _MOST_ENDED:
-            self._ended = self._ended[-_MOST_ENDED:]
-            self._ended_patches.keep(slice(-_MOST_ENDED, None))
+            self._keep_ended(slice(-_MOST_ENDED, None))
+
+    def _keep_ended(self, index: NDArray[np.bool_] | slice) -> None:
+        self._ended = self._ended[index]
+        self._away_until = self._away_until[index]
+        self._ended_patches.keep(index)
 
     def state(self) -> dict[str, Any]:
         """Everything that `restore` needs."""
@@ -222,11 +225,15 @@ class FlowTracker:
             new[again], ok[again] = self._patches.align(
                 grey, again, new[again], o.realign_check_px, o.realign_reach_px, self._pool
             )
-        ok &= _inside(new, grey.shape, o.border_px)
+        place = np.where(ok[:, None], new, start)
+        gone = ~_inside(place, grey.shape, o.border_px)
         if mask is not None:
-            ok &= ~_at(mask, new)
+            gone |= _at(mask, place)
         self._xy, self._velocity = new, new - old
-        self._end(np.nonzero(~ok)[0])
+        self._end(np.nonzero(gone)[0], self._frame + _AWAY)
+        if ok.mean() <= _MOST:  # what is lost alone slid along an edge, mostly, and would do so again
+            self._end(np.nonzero(~ok & ~gone)[0], self._frame)
+        ok &= ~gone
         self._keep(np.nonzero(ok)[0])
 
     def _usual_velocity(self, xy: Array) -> Array:
