@@ -155,32 +155,37 @@ def estimate_lens(
                 bent = None
     start, observations = seen_through(first)
     best, moves = _solved_as_it_moves(start, observations, o, adjustment.sigma, np.zeros(4), focal_prior)
-    std, _ = _standard_deviations(best)
-    known = float(std[:groups].max()) < FOCAL_STD
+    std, left_out, _ = _standard_deviations(best)
+    known = float(np.fmax(std, left_out)[:groups].max()) < FOCAL_STD
     # Strong distortion moves the valley of the focal length: a start without any does not lead there.
     starts = [(*seen_through(bent), adjustment.sigma, True)] if bent is not None else []
     starts += [(best.state, best.observations, best.sigma, moves)] if sigmas.any() else []
     found = _with_free_shape(starts, o, sigmas, focal_prior)
     if found is not None:
         full, full_moves = found
-        full_std, evidence = _standard_deviations(full, guess.shape)
+        full_std, full_left_out, evidence = _standard_deviations(full, guess.shape)
         displacement = _displacement(full, guess.shape)
         logger.info(
             "distortion %s, %.0f squared deviations, displaces by %.1f pixels; focal length within %.2f %%",
-            np.round(full.state.lens, 4), evidence, displacement, 100 * full_std[0],
+            np.round(full.state.lens, 4), evidence, displacement, 100 * max(full_std[0], full_left_out[0]),
         )  # fmt: skip
         joint = _JOINT_DISPLACEMENT * width * float(np.median(guess.focal)) / max(displacement, 1e-9)
-        moved = full.state.log_focal - best.state.log_focal
-        if evidence > _LEAST_EVIDENCE * (1.0 + evidence * joint**2):  # both variances add up
-            best, moves, std = full, full_moves, full_std
-            known = float(std[:groups].max()) < FOCAL_STD
-            if bent is None and not known:  # little asks for it: the truth may as well lie half-way
-                std[:groups] = np.fmax(std[:groups], 0.5 * np.abs(moved))
+        believed = evidence > _LEAST_EVIDENCE * (1.0 + evidence * joint**2)  # both variances add up
+        if believed and full_std[:groups].max() < FOCAL_STD:
+            best, moves, std, left_out = full, full_moves, full_std, full_left_out
+            known = float(np.fmax(std, left_out)[:groups].max()) < FOCAL_STD
         else:  # a distortion that is not believed may be there all the same: second moment around what is kept
-            known &= float(np.hypot(full_std[:groups], moved).max()) < _OPEN_FOCAL_STD
-            std[:groups] = np.fmax(std[:groups], np.hypot(full_std[:groups], moved))
-    lens, focal_std, shape_std = Lens(np.exp(best.state.log_focal), best.state.lens), std[:groups], std[groups:]
-    focal_std = np.zeros(groups) if held else focal_std
+            moved = np.append(full.state.log_focal - best.state.log_focal, np.full(4, np.nan))
+            std, left_out = (
+                np.fmax(kept, np.hypot(opened, moved)) for kept, opened in ((std, full_std), (left_out, full_left_out))
+            )
+            known &= float(np.fmax(std, left_out)[:groups].max()) < _OPEN_FOCAL_STD
+    lens, (focal_std, shape_std) = (
+        Lens(np.exp(best.state.log_focal), best.state.lens),
+        np.split(np.fmax(std, left_out), [groups]),
+    )
+    if held:
+        focal_std = np.zeros(groups)
     logger.info("focal length %s pixels within %s %%, guess %s", lens.focal, 100 * focal_std, guess.focal)
     misfit = best.sigma if best.sigma > _MISFIT * o.doubtful_px else 0.0
     far = np.abs(np.log(lens.focal / guess.focal)).max() > np.log(_LARGEST_RATIO)
@@ -188,7 +193,9 @@ def estimate_lens(
     if known:
         final, rough = lens, False
     else:
-        focal, rough = _kept_focal(lens.focal, focal_std, first_focal or (guess.focal, 0.0), counts=not (misfit or far))
+        focal, rough = _kept_focal(
+            lens.focal, std[:groups], first_focal or (guess.focal, 0.0), counts=not (misfit or far)
+        )
         final = Lens(focal, lens.shape if rough else guess.shape)
     if known or rough:
         state, observations, before = best.state if moves else through(start, lens.focal), best.observations, lens
@@ -377,20 +384,20 @@ def _check_invertible(observations: Observations) -> None:
         raise _NotInvertible
 
 
-def _standard_deviations(adjustment: BundleAdjustment, guess: Array | None = None) -> tuple[Array, float]:
+def _standard_deviations(adjustment: BundleAdjustment, guess: Array | None = None) -> tuple[Array, Array, float]:
     """(g + 4,) of log focal lengths and shape, NaN where held; and the evidence that the shape is not the guess.
 
-    Of the covariances the most doubtful one counts.
+    First from the residuals, of whose covariances the most doubtful one counts, then from what parts of the shot say.
     """
     groups = len(adjustment.state.log_focal)
     covariances = [*lens_covariances(adjustment), _left_out_covariance(adjustment)]
-    std = np.full(groups + 4, np.nan)
-    std[adjustment.free_lens] = np.sqrt(np.max([c.diagonal() for c in covariances], axis=0))
+    std = np.full((len(covariances), groups + 4), np.nan)
+    std[:, adjustment.free_lens] = np.sqrt([c.diagonal() for c in covariances])
     evidence = 0.0
     if guess is not None:
         away = (adjustment.state.lens - guess)[adjustment.free_lens[groups:] - groups]
         evidence = min(float(away @ np.linalg.solve(c[groups:, groups:], away)) for c in covariances)
-    return std, evidence
+    return std[:-1].max(0), std[-1], evidence
 
 
 def lens_covariances(adjustment: BundleAdjustment) -> list[Array]:
