@@ -180,12 +180,9 @@ def estimate_lens(
                 np.fmax(kept, np.hypot(opened, moved)) for kept, opened in ((std, full_std), (left_out, full_left_out))
             )
             known &= float(np.fmax(std, left_out)[:groups].max()) < _OPEN_FOCAL_STD
-    lens, (focal_std, shape_std) = (
-        Lens(np.exp(best.state.log_focal), best.state.lens),
-        np.split(np.fmax(std, left_out), [groups]),
-    )
-    if held:
-        focal_std = np.zeros(groups)
+    lens = Lens(np.exp(best.state.log_focal), best.state.lens)
+    focal_std, shape_std = np.split(np.fmax(std, left_out), [groups])
+    focal_std = np.zeros(groups) if held else focal_std
     logger.info("focal length %s pixels within %s %%, guess %s", lens.focal, 100 * focal_std, guess.focal)
     misfit = best.sigma if best.sigma > _MISFIT * o.doubtful_px else 0.0
     far = np.abs(np.log(lens.focal / guess.focal)).max() > np.log(_LARGEST_RATIO)
@@ -193,9 +190,9 @@ def estimate_lens(
     if known:
         final, rough = lens, False
     else:
-        focal, rough = _kept_focal(
-            lens.focal, std[:groups], first_focal or (guess.focal, 0.0), counts=not (misfit or far)
-        )
+        # In a long valley a standard deviation says little.
+        counts = not (misfit or far) and float(std[:groups].max()) < TOLD_FOCAL_STD
+        focal, rough = _kept_focal(lens.focal, focal_std, first_focal or (guess.focal, 0.0), counts=counts)
         final = Lens(focal, lens.shape if rough else guess.shape)
     if known or rough:
         state, observations, before = best.state if moves else through(start, lens.focal), best.observations, lens
@@ -216,12 +213,11 @@ def estimate_lens(
 def _kept_focal(found: Array, std: Array, first: tuple[Array, float], *, counts: bool) -> tuple[Array, bool]:
     """Focal lengths that the shot does not determine, (g,), and whether it has a say in them.
 
-    Where it knows them better than they were known at first, and as well as EXIF data would, they are the means of the
-    logarithms of both, each weighed by its variance; else those of before: in a long valley a standard deviation says
-    little.
+    Where it counts, and knows them better than they were known at first, they are the means of the logarithms of both,
+    each weighed by its variance; else those of before.
     """
     focal, first_std = first
-    if not counts or float(std.max()) >= min(first_std, TOLD_FOCAL_STD):
+    if not counts or float(std.max()) >= first_std:
         return focal, False
     share = first_std**2 / (first_std**2 + std**2)
     return np.asarray(found**share * focal ** (1.0 - share)), True
