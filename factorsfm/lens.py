@@ -241,13 +241,15 @@ def search_lens(
         focal = factor * guess.focal
         ratio = float(focal[0] / np.exp(near.log_focal[0])) if sigmas is not None else 1.0
         lens = Lens(focal, near.lens * ratio**_SHAPE_POWERS)  # the same pixels are moved as far
+        seen = renormalized(few, guess, lens, state.group)
+        if not np.isfinite(seen.xy).all():  # some pixels are seen by no ray of this lens
+            return np.inf, near
         problem = BundleAdjustment(
-            replace(through(near, focal), lens=lens.shape), renormalized(few, guess, lens, state.group), options,
+            replace(through(near, focal), lens=lens.shape), seen, options,
             sigma=adjustment.sigma, lens_sigmas=known, lens_mean=guess.shape,
         )  # fmt: skip
         problem.solve()
-        cost = problem.cost()
-        return (cost, problem.state) if np.isfinite(cost) else (np.inf, near)  # a shape that cannot be inverted
+        return problem.cost(), problem.state
 
     candidates = np.sort(0.5 * float(np.ptp(few.xy, axis=0).max()) / np.tan(_FIELDS_OF_VIEW / 2))
     fits = {1.0: fit(replace(state, lens=guess.shape), 1.0)}
