@@ -36,11 +36,11 @@ from factorsfm.problem import Observations, State
 from factorsfm.refinement import BundleAdjustment
 
 _SEVEN, _TWO = ("d01", "d03", "d04", "d05", "d07", "d08", "d10"), ("d04", "d07")
-DISTORTIONS = {
-    (-0.15, 0.02): _SEVEN,
+DISTORTIONS = {  # k1, k2, and shots
     (-0.3, 0.08): ("d01", "d04", "d06", "d07"),
+    (-0.15, 0.02): _SEVEN,
     (0.08, 0.0): _TWO,
-}  # k1, k2, and shots
+}
 _HELD = " focal length given"
 PARTS = ("reversed", "every second frame", "first half", "second half")
 _LONGER = 1.005
@@ -138,7 +138,7 @@ def focal_of_true_poses(known: factorsfm.Reconstruction, shot: Shot) -> float:
     unit = float(np.median(distance))
     focal = shot.camera.mean_focal_length()
     state = State(
-        rotation, translation * size / true_size / unit, points / distance[:, None], unit / distance, np.log([focal])
+        rotation, translation * size / max(true_size, 1e-9) / unit, points / distance[:, None], unit / distance, np.log([focal])
     )  # fmt: skip
     xy = normalized_from_pixels(shot.camera, known.observation_xy[order])
     observations = Observations(np.searchsorted(frames, known.observation_frame[order]), point, xy)
