@@ -137,9 +137,8 @@ def focal_of_true_poses(known: factorsfm.Reconstruction, shot: Shot) -> float:
     points, distance = points[seen], distance[seen]
     unit = float(np.median(distance))
     focal = shot.camera.mean_focal_length()
-    state = State(
-        rotation, translation * size / max(true_size, 1e-9) / unit, points / distance[:, None], unit / distance, np.log([focal])
-    )  # fmt: skip
+    translation *= size / max(true_size, 1e-9) / unit
+    state = State(rotation, translation, points / distance[:, None], unit / distance, np.log([focal]))
     xy = normalized_from_pixels(shot.camera, known.observation_xy[order])
     observations = Observations(np.searchsorted(frames, known.observation_frame[order]), point, xy)
     held, options, sigma = np.ones(len(frames), bool), PolishOptions(tolerance=1e-6), 3.0

@@ -332,7 +332,7 @@ def _solved_as_it_moves(
             motion.rotation_only, best.observations, options, sigma=best.sigma, free_translation=False, free_focal=True,
             focal_prior=focal_prior, lens_sigmas=sigmas,
         )  # fmt: skip
-        rotating.solve(_SEARCH_ITERATIONS)
+        rotating.solve()
         general = translation_gain(rotating, undistorted) > LEAST_GAIN
     if general:
         return best, True
