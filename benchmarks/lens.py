@@ -1,5 +1,7 @@
 """Unknown lenses: focal length and poses of each shot without its camera, and shots distorted by known lenses.
 
+Also of each shot reversed, its halves and every second frame: other tracks, for which nothing was made.
+
     python -m benchmarks.lens --data FOLDER --models FOLDER
 
 FOLDER/studiosim and FOLDER/real hold the shots with their truth (`benchmarks.inputs`). Rows that were measured before
@@ -27,10 +29,20 @@ from factorsfm.camera import normalized_from_pixels, pixels_from_normalized, wit
 from factorsfm.evaluation.metrics import auc, relative_pose_errors
 from factorsfm.evaluation.readers import read_shot
 from factorsfm.evaluation.truth import Shot
+from factorsfm.lens import Lens, renormalized
+from factorsfm.noise import coordinate_sigma
+from factorsfm.options import PolishOptions
+from factorsfm.problem import Observations, State
+from factorsfm.refinement import BundleAdjustment
 
 _SEVEN, _TWO = ("d01", "d03", "d04", "d05", "d07", "d08", "d10"), ("d04", "d07")
-DISTORTIONS = {(-0.15, 0.02): _SEVEN, (-0.3, 0.08): _TWO, (0.08, 0.0): _TWO}  # k1, k2, and shots
+DISTORTIONS = {  # k1, k2, and shots
+    (-0.3, 0.08): ("d01", "d04", "d06", "d07"),
+    (-0.15, 0.02): _SEVEN,
+    (0.08, 0.0): _TWO,
+}
 _HELD = " focal length given"
+PARTS = ("reversed", "every second frame", "first half", "second half")
 _LONGER = 1.005
 _SCALES = np.linspace(0.95, 1.05, 401)
 _RESULTS = Path(__file__).parent / "results"
@@ -59,6 +71,20 @@ class Distorted:
 
     def _seen(self, image: NDArray[np.uint8], interpolation: int) -> cv2.typing.MatLike:
         return cv2.remap(image, self._source, None, interpolation, borderMode=cv2.BORDER_REPLICATE)
+
+
+class Part:
+    """Some frames of a shot, as one of `PARTS` says."""
+
+    def __init__(self, shot: Shot, name: str) -> None:
+        frames = list(shot.frames())
+        middle = len(frames) // 2
+        cuts = (slice(None, None, -1), slice(None, None, 2), slice(None, middle), slice(middle, None))
+        self._frames = frames[dict(zip(PARTS, cuts, strict=True))[name]]
+
+    def __iter__(self) -> Iterator[factorsfm.Frame]:
+        for index, frame in enumerate(self._frames):
+            yield replace(frame, index=index)
 
 
 def true_lens(shot: Shot, k1: float, k2: float) -> pycolmap.Camera:
@@ -92,6 +118,42 @@ def bent_px(lens: pycolmap.Camera, truth: pycolmap.Camera) -> float:
     return min(float(np.median(difference_px(lens, truth, scale))) for scale in _SCALES)
 
 
+def focal_of_true_poses(known: factorsfm.Reconstruction, shot: Shot) -> float:
+    """Focal length with which the tracks of a reconstruction fit the true poses, in pixels.
+
+    Where it is not the true one, poses and camera of the reference do not belong together.
+    """
+    frames = np.array([f.index for f in known.registered])
+    found = [f.cam_from_world for f in known.registered if f.cam_from_world is not None]
+    world_from_cam, centers = shot.truth(frames)
+    rotation = np.swapaxes(world_from_cam, 1, 2) @ world_from_cam[0]
+    translation = -np.einsum("kji,kj->ki", world_from_cam, centers - centers[0])
+    points = known.points @ found[0].rotation.matrix().T + found[0].translation
+    estimated = np.array([p.inverse().translation for p in found])
+    size, true_size = (np.linalg.norm(c - c[0], axis=1).max() for c in (estimated, centers))
+    distance = np.linalg.norm(points, axis=1)
+    order = np.argsort(known.observation_point, kind="stable")
+    seen, point = np.unique(known.observation_point[order], return_inverse=True)
+    points, distance = points[seen], distance[seen]
+    unit = float(np.median(distance))
+    focal = shot.camera.mean_focal_length()
+    translation *= size / max(true_size, 1e-9) / unit
+    state = State(rotation, translation, points / distance[:, None], unit / distance, np.log([focal]))
+    xy = normalized_from_pixels(shot.camera, known.observation_xy[order])
+    observations = Observations(np.searchsorted(frames, known.observation_frame[order]), point, xy)
+    held, options, sigma = np.ones(len(frames), bool), PolishOptions(tolerance=1e-6), 3.0
+    for free in (False, True, True, True):
+        adjustment = BundleAdjustment(
+            state, observations, options, sigma=sigma, fixed=held, free_focal=free, points_only=not free
+        )  # fmt: skip
+        state = adjustment.solve()
+        sigma = coordinate_sigma(adjustment.reprojection_errors())
+        after = Lens(np.exp(state.log_focal), np.zeros(4))
+        observations = renormalized(observations, Lens(np.array([focal]), np.zeros(4)), after, state.group)
+        focal = float(after.focal[0])
+    return focal
+
+
 def pose_auc(result: factorsfm.Reconstruction, shot: Shot) -> str:
     """AUC of the relative poses at 1 and 5 degrees."""
     poses = [f.cam_from_world.inverse() for f in result.registered if f.cam_from_world is not None]
@@ -109,6 +171,7 @@ def main() -> None:
     parser.add_argument("--shots", nargs="*", default=[f"d{k:02d}" for k in range(1, 11)], help="beginnings of names")
     parser.add_argument("--distorted", nargs="*", default=_SEVEN, help="the same, of those to see through other lenses")
     parser.add_argument("--held", action="store_true", help="the latter with their focal length given")
+    parser.add_argument("--parts", nargs="*", default=[], help="the same, of those to see in parts")
     arguments = parser.parse_args()
     depth = factorsfm.DepthModel(arguments.models / NETWORK_FILES["tcmonodepth"])
     folders = sorted(arguments.data.glob("*/*"))
@@ -123,6 +186,11 @@ def main() -> None:
     for folder in folders:
         if folder.name.startswith(tuple(arguments.shots)):
             keep(folder.name, shot_row(read_shot(folder), depth))
+        if folder.name.startswith(tuple(arguments.parts)):
+            shot = read_shot(folder)
+            for part in PARTS:
+                result = factorsfm.reconstruct(Part(shot, part), depth=depth, masks=shot.masks)
+                keep(f"{folder.name}, {part}", _found(result, shot.camera))
     for (k1, k2), names in DISTORTIONS.items():
         for folder in folders:
             if folder.name.startswith(names) and folder.name.startswith(tuple(arguments.distorted)):
@@ -137,8 +205,10 @@ def shot_row(shot: Shot, depth: factorsfm.DepthModel) -> Row:
     result = factorsfm.reconstruct(shot.source, depth=depth, masks=shot.masks)
     seconds = time.perf_counter() - begin
     focal = f"{shot.camera.mean_focal_length():.0f}"
-    return {"parallax": f"{known.parallax:.3f}", "true f": focal, "AUC, lens known": pose_auc(known, shot)} | {
-        **_found(result, shot, shot.camera), "s": f"{seconds:.0f}"
+    return {
+        "parallax": f"{known.parallax:.3f}", "true f": focal,
+        "f of true poses": f"{focal_of_true_poses(known, shot):.0f}", "AUC, lens known": pose_auc(known, shot),
+        **_found(result, shot.camera), "AUC": pose_auc(result, shot), "s": f"{seconds:.0f}",
     }  # fmt: skip
 
 
@@ -150,14 +220,15 @@ def distorted_row(shot: Shot, depth: factorsfm.DepthModel, k1: float, k2: float,
     result = factorsfm.reconstruct(seen, camera=camera, depth=depth, masks=seen, lens="radial" if held else "auto")
     found, off = result.camera, difference_px(result.camera, truth)
     k = found.params[3:] if found.model_name == "RADIAL" else (0.0, 0.0)
-    return _found(result, shot, truth) | {
+    return _found(result, truth) | {
+        "AUC": pose_auc(result, shot),
         "k1": f"{k[0]:.4f}", "k2": f"{k[1]:.4f}",
         "px: median": f"{np.median(off):.2f}", "largest": f"{off.max():.2f}",
         "at its own focal length": f"{bent_px(found, truth):.2f}",
     }  # fmt: skip
 
 
-def _found(result: factorsfm.Reconstruction, shot: Shot, truth: pycolmap.Camera) -> Row:
+def _found(result: factorsfm.Reconstruction, truth: pycolmap.Camera) -> Row:
     fit = result.lens
     assert fit is not None
     error = result.camera.mean_focal_length() / truth.mean_focal_length() - 1
@@ -165,7 +236,6 @@ def _found(result: factorsfm.Reconstruction, shot: Shot, truth: pycolmap.Camera)
         "error %": f"{100 * error:+.2f}",
         "std %": f"{100 * fit.focal_std:.2f}" if fit.focal_std is not None else "-",
         "determined": "yes" if fit.determined else "no",
-        "AUC": pose_auc(result, shot),
     }
 
 
@@ -173,7 +243,8 @@ def report(rows: dict[str, Row]) -> str:
     """The tables, as Markdown."""
     rows = dict(sorted(rows.items()))
     plain = {key: row for key, row in rows.items() if " " not in key}
-    bent = {key: row for key, row in rows.items() if " " in key and not key.endswith(_HELD)}
+    parts = {key: row for key, row in rows.items() if key.endswith(PARTS)}
+    bent = {key: row for key, row in rows.items() if " " in key and not key.endswith((_HELD, *PARTS))}
     held = {key.removesuffix(_HELD): row for key, row in rows.items() if key.endswith(_HELD)}
     return "\n".join(
         [
@@ -181,8 +252,11 @@ def report(rows: dict[str, Row]) -> str:
             "`python -m benchmarks.lens --data FOLDER --models FOLDER`, and the real sets with `--shots NAME ...`", "",
             "Prior: TCMonoDepth; masks where the shot has them. AUC: relative poses at 1 / 5 degrees. std: of the "
             "focal length. Not determined: not certain enough to count as an estimate; without a std the first guess "
-            "is kept.", "",
+            "is kept. f of true poses: with which the tracks fit the true poses; where it is another one, poses and "
+            "camera of the reference do not belong together.", "",
             *_table("shot", plain),
+            "Parts of the same shots (`--parts NAME ...`):", "",
+            *_table("shot, part", parts),
             "The same seen through lenses with distortion k1, k2, and unknown; the focal length is a little longer, so "
             "that the image is full. px: between the pixels of the same ray in the true and in the found lens, over "
             "the image; at its own focal length: the median of what is left when the error of the focal length is "

@@ -9,6 +9,7 @@ distance, in which small motion is almost linear.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,7 +47,7 @@ class BundleAdjustment:
         focal_prior: (g,) mean and (g, g) information matrix with which the logarithms of the focal lengths are known
             beforehand; None: not at all.
         lens_sigmas: (4,) standard deviations with which `State.lens` is known beforehand (0: exactly); None: it is
-            zero, the observations are undistorted.
+            zero, the observations are undistorted. lens_mean: (4,) around what; None: around the state's.
         points_only: True holds everything but the points fixed.
         fixed: (k,) frames whose poses are held; by default the one that is the world. Those without observations are
             held as well.
@@ -67,6 +68,7 @@ class BundleAdjustment:
         free_focal: bool = False,
         focal_prior: tuple[Array, Array] | None = None,
         lens_sigmas: Array | None = None,
+        lens_mean: Array | None = None,
         points_only: bool = False,
         fixed: NDArray[np.bool_] | None = None,
         prior: PriorObservations | None = None,
@@ -89,7 +91,7 @@ class BundleAdjustment:
         self._focal_prior = focal_prior
         self._group = state.group[observations.frame]
         self._lens_sigmas = lens_sigmas
-        self._lens_anchor = state.lens
+        self._lens_mean = state.lens if lens_mean is None else lens_mean
         seen = observations.xy if lens_sigmas is None else distort(observations.xy, state.lens)[0]
         self._pixels = seen * self._focal(state)[:, None]  # what was measured, whatever the lens
         frames, images, nodes = len(state.rotation), len(state.scale), len(state.field)
@@ -111,6 +113,10 @@ class BundleAdjustment:
         if not free_translation:
             free[: self._lens].reshape(-1, 6)[:, 3:] = False
         self._free = np.nonzero(free & (not points_only))[0]
+        self._freedom: dict[str, Any] = {
+            "free_translation": free_translation, "free_focal": free_focal, "focal_prior": focal_prior,
+            "lens_sigmas": lens_sigmas, "lens_mean": self._lens_mean, "fixed": held,
+        }  # fmt: skip
         self._lens_is_free = free_focal or lens_sigmas is not None
         self.free_lens = np.nonzero(free[self._lens : self._affine])[0]  # of log focal lengths and `State.lens`
         self._elimination = Elimination(self._columns, len(state.bearing))
@@ -163,7 +169,7 @@ class BundleAdjustment:
         """Differences to what is known of the lens, and the information; none of it where nothing is estimated."""
         sigmas = np.zeros(4) if self._lens_sigmas is None else self._lens_sigmas
         free = sigmas > 0
-        return np.where(free, state.lens - self._lens_anchor, 0.0), np.where(free, sigmas, np.inf) ** -2.0
+        return np.where(free, state.lens - self._lens_mean, 0.0), np.where(free, sigmas, np.inf) ** -2.0
 
     def prior_residuals(self, state: State | None = None) -> Array:
         """(m,) residuals of the prior (unit of its inverse depth)."""
@@ -284,7 +290,27 @@ class BundleAdjustment:
             self.control.add(s, camera, gradient, self._control)
         return normal
 
+    def of(self, rows: NDArray[np.bool_]) -> BundleAdjustment:
+        """The tracks alone, with some of their observations, where two of a point are left."""
+        o = self.observations
+        rows = rows & (np.bincount(o.point, rows)[o.point] >= 2)
+        points, point = np.unique(o.point[rows], return_inverse=True)
+        part = BundleAdjustment(
+            self.state.of(points), Observations(o.frame[rows], point, o.xy[rows]), self.options,
+            sigma=self.sigma, **self._freedom,
+        )  # fmt: skip
+        part._anchor, part._point_sigma = self._anchor[points], self._point_sigma
+        return part
+
     # --- solving ------------------------------------------------------------------------------------------------
+
+    def lens_step(self) -> Array:
+        """By how much a Newton step moves what is free of log focal lengths and shape; 0 of what nothing is seen."""
+        information, gradient = self.condensed()
+        seen = information.diagonal() > 1e-200
+        step = np.zeros(len(gradient))
+        step[seen] = -np.linalg.solve(information[np.ix_(seen, seen)], gradient[seen])
+        return step[np.searchsorted(self._free, self._lens + self.free_lens)]
 
     def condensed(self) -> tuple[Array, Array]:
         """Information matrix and gradient of the free camera side at the present state, the points eliminated."""

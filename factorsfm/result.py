@@ -252,17 +252,16 @@ def _lens_note(estimate: LensEstimate) -> str:
             f" It changes from {focals[0]:.0f} to {focals[-1]:.0f} pixels; the ratio of the longest to the shortest is "
             f"{focals.max() / focals.min():.3f} ± {estimate.zoom_std * focals.max() / focals.min():.3f}."
         )
-    if estimate.rough:
-        return f"The focal length is known roughly, and counts as not determined: {focal:.0f} pixels, {std}.{zoom}"
-    if not estimate.determined:
+    if not (estimate.determined or estimate.rough):
         reason = f"this shot does not determine it ({std})"
         if estimate.misfit_px:
             reason = f"the tracks fit no lens (typical error {estimate.misfit_px:.2f} pixels)"
         kept = "as it was given" if held else f"a guess ({focal:.0f} pixels)"
         return f"The focal length is {kept}: {reason}.{zoom}"
-    note = (
-        "The focal length is as it was given" if held else f"The focal length was estimated: {focal:.0f} pixels, {std}"
-    )
+    note = "The focal length was estimated"
+    if estimate.rough:
+        note = "The focal length is known roughly, and counts as not determined"
+    note = "The focal length is as it was given" if held else f"{note}: {focal:.0f} pixels, {std}"
     if np.isfinite(estimate.shape_std[0]):
         k, k_std = estimate.lens.shape, estimate.shape_std
         note += f"; radial distortion k1 {k[0]:.3f} ± {k_std[0]:.3f}, k2 {k[1]:.3f} ± {k_std[1]:.3f}"
