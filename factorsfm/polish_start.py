@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from factorsfm.converge import converge_cameras, core_tracks
 from factorsfm.images import MappedImage
-from factorsfm.lens import Lens, LensEstimate, estimate_lens
+from factorsfm.lens import Lens, LensEstimate
+from factorsfm.lens_estimate import estimate_lens
 from factorsfm.noise import FIRST_SIGMA_PX, block_inflation
 from factorsfm.observability import Motion, classify_motion
 from factorsfm.options import Options, PolishOptions

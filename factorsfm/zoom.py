@@ -8,7 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.lens import Lens, lens_covariances, solved_with_lens
+from factorsfm.lens import Lens
+from factorsfm.lens_certainty import lens_covariances
+from factorsfm.lens_estimate import solved_with_lens
 from factorsfm.observability import LEAST_GAIN, translation_gain
 from factorsfm.options import PolishOptions
 from factorsfm.problem import Observations, State

@@ -13,17 +13,10 @@ from factorsfm.cli import main
 from factorsfm.converge import _everywhere
 from factorsfm.errors import InputError
 from factorsfm.factors import distort
-from factorsfm.lens import (
-    Lens,
-    _left_out_covariance,
-    _solved_as_it_moves,
-    lens_covariances,
-    renormalized,
-    search_lens,
-    solved_with_lens,
-    through,
-    undistort,
-)
+from factorsfm.lens import Lens, renormalized, through, undistort
+from factorsfm.lens_certainty import _left_out_covariance, lens_covariances
+from factorsfm.lens_estimate import _solved_as_it_moves, solved_with_lens
+from factorsfm.lens_search import search_lens
 from factorsfm.noise import image_cells
 from factorsfm.options import FOCAL_STD, TOLD_FOCAL_STD, Options, PolishOptions
 from factorsfm.polish import polish
