@@ -63,6 +63,16 @@ def test_every_frame_has_a_causal_pose(run):
     assert np.all(np.diff(z) > 0)  # the dolly goes forward
 
 
+def test_new_points_are_those_that_the_map_gained():
+    with stream() as s:
+        for image in rendered("dolly").images:
+            before = len(s.points[0])
+            gained = s.push(image).new_points
+            assert gained >= len(s.points[0]) - before  # others may have been taken away
+            assert gained >= 30 or before > 0  # the start
+        assert len(s.points[0]) > 100
+
+
 def test_the_polished_path_is_the_true_one(run):
     _, result = run
     error = errors_of(result, rendered("dolly"))
