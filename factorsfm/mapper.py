@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.evaluation.alignment import nearest_rotation
 from factorsfm.given_covariance import given_covariance
 from factorsfm.graph_process import GraphProcess
-from factorsfm.images import ImageTracks, MappedImage, median_flow, renormalize, shared_tracks
+from factorsfm.images import ImageTracks, MappedImage, renormalize, shared_tracks
 from factorsfm.initialization import NoStart, Start
+from factorsfm.keyframes import carry, is_keyframe
 from factorsfm.map_registration import NotOnMap, register_by_corners, register_on_map
 from factorsfm.map_update import YOUNG_KEYFRAMES, MapCopy, MapUpdate, add_tracks
 from factorsfm.options import Options
@@ -41,7 +41,6 @@ _MOST_MIRRORED = 3  # updates in a row; then it is the prior that is wrong, not 
 _RUNNING_OUT = 0.5  # share of an image's tracks with a point, below which the map is extended at once
 _SETTLED, _SETTLED_DELAY = 5, 2  # keyframes of a map that changes little; frames that it waits longer for the graph
 _REACH = 60  # images to both sides of a lost one from which its tracks are triangulated
-_LEAST_SHARED = 0.7  # of the tracks of the last keyframe; with fewer, a new one is made
 
 
 class Mapper:
@@ -332,18 +331,8 @@ class Mapper:
     # --- keyframes and landmarks --------------------------------------------------------------------------------
 
     def _is_keyframe(self, image: MappedImage) -> bool:
-        o, count = self.options, len(self.keyframes)
         last = self.images[self.keyframes[-1]].tracks
-        shared = shared_tracks(image.tracks, last)
-        # A young map has the shape that the prior guessed: the first keyframes come soon. Of a camera that hardly
-        # moves, ever fewer are needed.
-        youth = min(1.0, 0.25 * count)
-        interval = min(2 * count, o.keyframe_interval) * max(1, count // 10)
-        return bool(
-            shared < _LEAST_SHARED * len(last.ids)
-            or median_flow(image.tracks, last) * self.focal > youth * o.keyframe_flow * self.width
-            or image.tracks.position - last.position >= interval
-        )
+        return is_keyframe(image.tracks, last, len(self.keyframes), self.focal, self.width, self.options)
 
     def _add_keyframe(self, image: MappedImage, read_depth: Callable[[], ImageDepth | None] | None) -> None:
         """Let the graph work on the keyframe; the map takes over its result after `graph_delay` frames."""
@@ -390,7 +379,7 @@ class Mapper:
         for position, affine in update.affines.items():
             self.images[position].affine = affine
         self.burn_ins = np.union1d(self.burn_ins, update.burn_ins)
-        self._carry(update.position, before)
+        carry(image, before, self.images[update.position + 1 :])
         if update.focal is not None:
             self._set_focal(update.focal)
 
@@ -424,15 +413,3 @@ class Mapper:
         """Normalise all that was seen with another focal length."""
         renormalize(self.images, self.focal / focal)
         self.focal = focal
-
-    def _carry(self, position: int, before: tuple[Array, Array]) -> None:
-        """Move the images after a keyframe with it: they were registered on the map as it was before."""
-        rotation, translation = self.images[position].pose
-        for image in self.images[position + 1 :]:
-            if image.registered:
-                turn, shift = image.pose
-                relative = turn @ before[0].T
-                # Rotations that stem from each other are alike in how far they are none: here it would be three times
-                # as far, at every keyframe.
-                image.rotation = nearest_rotation(relative @ rotation)
-                image.translation = relative @ (translation - before[1]) + shift
