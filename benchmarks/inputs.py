@@ -184,5 +184,9 @@ def simulated_prior(name: str, data: Path, cache: Path) -> Path:
             made = Path(scratch) / "maps"
             script = [sys.executable, str(data / "simulate_prior.py"), str(shot_folder(data, name)), str(made)]
             subprocess.run(script, check=True, stdout=subprocess.DEVNULL)
-            made.rename(folder)
+            try:
+                made.rename(folder)
+            except OSError:
+                if not folder.is_dir():  # else another process was faster
+                    raise
     return folder
