@@ -211,9 +211,9 @@ def test_killed_in_the_middle_of_an_update(graph, shot, caplog):
 def test_killed_while_nobody_needs_it(shot):
     with GraphProcess() as graph:
         graph.submit(shot.copy(2), None).result()
-        pid = pid_of(graph)
-    os.kill(pid, signal.SIGKILL)
-    wait_until(lambda: has_ended(pid))
+        process = graph._process
+    os.kill(process._popen.pid, signal.SIGKILL)
+    wait_until(lambda: not process.lives)  # all of its threads
     with GraphProcess() as graph:
         assert graph.submit(shot.copy(2), None).result().committed
 
