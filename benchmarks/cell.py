@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.inputs import VARIANTS, open_frames, open_prior, open_shot
+from benchmarks.inputs import VARIANTS, open_frames, open_prior, open_shot, settle
 from benchmarks.plan import AS_SET, COLMAP, UNORDERED, Cell
 from benchmarks.store import Record, cell_key, record_path, save
 from benchmarks.usage import cpu_seconds, peak_mb
@@ -227,7 +227,7 @@ def _matches(cell: Cell, shot: Shot, folders: Folders) -> tuple[baselines.Matche
                 "cost": {"cpu_seconds": cpu_seconds(), "peak_mb": peak_mb()},
             }
             (scratch / "matches.json").write_text(json.dumps(facts))
-            scratch.rename(folder)
+            settle(scratch, folder)
         finally:
             shutil.rmtree(scratch, ignore_errors=True)
     facts = json.loads((folder / "matches.json").read_text())

@@ -184,9 +184,14 @@ def simulated_prior(name: str, data: Path, cache: Path) -> Path:
             made = Path(scratch) / "maps"
             script = [sys.executable, str(data / "simulate_prior.py"), str(shot_folder(data, name)), str(made)]
             subprocess.run(script, check=True, stdout=subprocess.DEVNULL)
-            try:
-                made.rename(folder)
-            except OSError:
-                if not folder.is_dir():  # else another process was faster
-                    raise
+            settle(made, folder)
     return folder
+
+
+def settle(made: Path, folder: Path) -> None:
+    """Give a finished folder its place, unless another process was faster."""
+    try:
+        made.rename(folder)
+    except OSError:
+        if not folder.is_dir():
+            raise
