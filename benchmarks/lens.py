@@ -148,8 +148,8 @@ def focal_of_true_poses(known: factorsfm.Reconstruction, shot: Shot) -> float:
         )  # fmt: skip
         state = adjustment.solve()
         sigma = coordinate_sigma(adjustment.reprojection_errors())
-        after = Lens(np.exp(state.log_focal), np.zeros(4))
-        observations = renormalized(observations, Lens(np.array([focal]), np.zeros(4)), after, state.group)
+        after = Lens(np.exp(state.log_focal))
+        observations = renormalized(observations, Lens(np.array([focal])), after, state.group)
         focal = float(after.focal[0])
     return focal
 

@@ -19,7 +19,7 @@ from factorsfm.control import Control, find_frames, read_control
 from factorsfm.errors import InputError
 from factorsfm.frames import Frame, checked_range, list_images, range_text, read_frames
 from factorsfm.image_set import ImageSet
-from factorsfm.options import LensFreedom, Options
+from factorsfm.options import LensFreedom, Options, ShutterUse
 from factorsfm.priors.depth import DepthFolder, DepthKind, DepthPrior, open_depth
 from factorsfm.priors.masks import MaskFolder, MaskPrior, open_masks
 from factorsfm.reconstruction import Reconstruction
@@ -39,6 +39,7 @@ def reconstruct(
     frames: slice | None = None,
     preset: str = "default",
     lens: LensFreedom = "auto",
+    shutter: ShutterUse = "auto",
     unordered: bool | None = None,
     features: str | Path = "sift",
     work: str | Path | None = None,
@@ -59,6 +60,7 @@ def reconstruct(
         frames: range of the source's frames.
         preset: see `options.PRESETS`.
         lens: what of the lens is estimated where the shot determines it, see `Options`.
+        shutter: what is done with a rolling shutter, see `Options`.
         unordered: whether the images are a set in any order, which are matched with each other, or a shot, which is
             tracked from frame to frame; None decides for folders by `unordered.looks_unordered`.
         features: of a set: "sift"; "xfeat", whose networks lie in the folder that ``FACTORSFM_MODELS`` names; or a
@@ -73,9 +75,13 @@ def reconstruct(
         ReconstructionError: the shot cannot be reconstructed.
     """
     begin = time.perf_counter()
-    if lens not in get_args(LensFreedom):
-        raise InputError(f"unknown lens '{lens}', expected one of {', '.join(get_args(LensFreedom))}")
-    options = replace(Options.preset_named(preset), lens=lens)
+    for name, value, known_values in (
+        ("lens", lens, get_args(LensFreedom)),
+        ("shutter", shutter, get_args(ShutterUse)),
+    ):
+        if value not in known_values:
+            raise InputError(f"unknown {name} '{value}', expected one of {', '.join(known_values)}")
+    options = replace(Options.preset_named(preset), lens=lens, shutter=shutter)
     camera = open_camera(camera)
     frames = checked_range(frames) if frames is not None else None
     prior = open_depth(depth, depth_kind) if options.uses_depth else None

@@ -20,7 +20,7 @@ from factorsfm.errors import FactorsfmError, ReconstructionError
 from factorsfm.export import command as export_command
 from factorsfm.export.folder import check_directory, write_failure, write_folder
 from factorsfm.frames import parse_range
-from factorsfm.options import PRESETS, LensFreedom
+from factorsfm.options import PRESETS, LensFreedom, ShutterUse
 from factorsfm.priors.depth import DepthKind
 from factorsfm.report import command as overlay_command
 from factorsfm.stream_command import unless_none
@@ -93,6 +93,7 @@ def _reconstruct(arguments: argparse.Namespace, progress: _Progress) -> str:
             frames=frames,
             preset=arguments.preset,
             lens=arguments.lens,
+            shutter=arguments.shutter,
             unordered=arguments.unordered or None,
             features=arguments.features,
             work=arguments.work,
@@ -348,6 +349,14 @@ def _add_shot_arguments(parser: argparse.ArgumentParser, output: str = _RESULT) 
         help="what of the lens is estimated where the shot determines it: nothing, the focal length, also the radial "
         "distortion, or also the principal point; radial: the distortion alone; zoom: distortion, and a focal length "
         "for every frame; auto: fixed with --camera, distortion without",
+    )
+    parser.add_argument(
+        "--shutter",
+        choices=get_args(ShutterUse),
+        default="auto",
+        help="what is done with a rolling shutter that the video shows. auto: lens and points are free of it, poses "
+        "fit the recorded images; rolling: poses are those of the moment at which the middle of the image is read; "
+        "global: it is not looked for",
     )
     parser.add_argument("--preset", choices=list(PRESETS), default="default", help="default: %(default)s")
 

@@ -32,11 +32,11 @@ def converge_cameras(start: State, few: Observations, options: Options) -> tuple
     incremental map may have been bent or depth-reversed beyond repair. Other starts are tried then, and the best fit
     is kept. (A single track may well repeat its error for many frames: it slides along what it follows.)
     """
-    kept, best = np.arange(len(start.bearing)), _solve_core(start, few, options)
+    kept, best = np.arange(len(start.bearing)), converge(start, few, options)
     rests = resting(few, float(np.median(start.focal)))
     if rests.any():
         others = np.nonzero(~rests)[0]
-        alone = _solve_core(start.of(others), few.of(others), options)
+        alone = converge(start.of(others), few.of(others), options)
         if contradicts(best, alone, ~rests):
             logger.info("%d of %d points rest in the image and are left out", rests.sum(), len(rests))
             kept, start, few, best = others, start.of(others), alone.observations, alone
@@ -45,8 +45,8 @@ def converge_cameras(start: State, few: Observations, options: Options) -> tuple
         or block_inflation(best.reprojection_vectors(), few) > _DOUBTFUL_INFLATION
     ):
         logger.info("the solution does not fit (%.2f px), trying other starts", best.sigma)
-        best = _better(best, _solve_core(_flat(start, few, options.polish), few, options))
-        best = _better(best, _solve_core(_reversed(best.state), few, options))
+        best = _better(best, converge(_flat(start, few, options.polish), few, options))
+        best = _better(best, converge(_reversed(best.state), few, options))
     return kept, best
 
 
@@ -58,7 +58,7 @@ def _better(known: BundleAdjustment, other: BundleAdjustment) -> BundleAdjustmen
     return other if other_cost < _CLEARLY * cost else known
 
 
-def _solve_core(part: State, few: Observations, options: Options) -> BundleAdjustment:
+def converge(part: State, few: Observations, options: Options) -> BundleAdjustment:
     """Converged from one start, first with a wide kernel."""
     o = options.polish
     errors = BundleAdjustment(part, few, o, sigma=1.0).reprojection_errors()

@@ -100,12 +100,12 @@ def distort(uv: Array, lens: Array) -> tuple[Array, Array, Array]:
 
     Args:
         uv: (n, 2) undistorted normalised image coordinates.
-        lens: (4,) k1, k2, and the principal point's displacement in focal lengths.
+        lens: (4,) k1, k2, and the principal point's displacement in focal lengths; what follows is of no concern here.
 
     Returns:
         (n, 2) distorted coordinates, their derivative by `uv` (n, 2, 2) and by `lens` (n, 2, 4).
     """
-    k1, k2 = lens[:2]
+    k1, k2, *center = lens[:4]
     square = np.einsum("ni,ni->n", uv, uv)[:, None]
     gain = 1.0 + square * (k1 + square * k2)
     by_uv = np.einsum("ni,nj->nij", uv * (2.0 * k1 + 4.0 * k2 * square), uv)
@@ -113,7 +113,7 @@ def distort(uv: Array, lens: Array) -> tuple[Array, Array, Array]:
     by_lens = np.zeros((len(uv), 2, 4))
     by_lens[:, :, 0], by_lens[:, :, 1] = uv * square, uv * square**2
     by_lens[:, [0, 1], [2, 3]] = 1.0
-    return uv * gain + lens[2:], by_uv, by_lens
+    return uv * gain + center, by_uv, by_lens
 
 
 def affine_inverse_depth(

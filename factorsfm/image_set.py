@@ -316,11 +316,11 @@ class ImageSet:
     def _add_lenses(self, result: Reconstruction, first: pycolmap.Camera, lens: LensEstimate | None) -> None:
         """The lenses of the images at full size, and errors in their pixels instead of those of the map."""
         ratio = result.camera.mean_focal_length() / first.mean_focal_length()
-        shape = lens.lens.shape if lens is not None and self.camera is None else np.zeros(4)
+        shape = lens.lens.shape if lens is not None and self.camera is None and lens.lens.bends else None
         lenses = []
         for k, camera in enumerate(self._cameras):
             focal = ratio * camera.mean_focal_length()
-            own = with_lens(camera, focal, shape) if shape.any() else with_focal(camera, focal)
+            own = with_focal(camera, focal) if shape is None else with_lens(camera, focal, shape)
             lenses.append(_resized(result.camera, (camera.width, camera.height)) if k == 0 else own)
         shared = Counter(p.camera for p, f in zip(self.photos, result.frames, strict=True) if f.registered)
         most = shared.most_common(1)[0][0]

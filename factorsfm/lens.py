@@ -2,25 +2,36 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
 from factorsfm.factors import distort
-from factorsfm.problem import Observations, State
+from factorsfm.options import LensFreedom
+from factorsfm.problem import LENS_SIZE, Observations, State
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
+DISTORTION, READOUT = slice(0, 4), slice(4, 6)  # of `State.lens`: distortion with principal point, readout
+READOUT_SIGMA = 1.0  # frames, of a rolling shutter of which nothing is known
+_DISTORTION_SIGMA = 0.1
+_CENTER_SIGMA = 0.02  # of the width
+
 
 @dataclass(frozen=True, slots=True)
 class Lens:
-    """(g,) focal lengths (pixels), and (4,) distortion and principal point as in `factors.distort`."""
+    """(g,) focal lengths (pixels), and (6,) shape as in `State.lens`."""
 
     focal: Array
-    shape: Array
+    shape: Array = field(default_factory=lambda: np.zeros(LENS_SIZE))
+
+    @property
+    def bends(self) -> bool:
+        """Whether there is distortion or a principal point elsewhere."""
+        return bool(self.shape[DISTORTION].any())
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +41,7 @@ class LensEstimate:
     Attributes:
         guess: with which the tracks were undistorted; lens: what the shot says, or the guess.
         focal_std: (g,) relative standard deviations of the estimated focal lengths, believed or not; 0 of known ones.
-        shape_std: (4,) standard deviations of the shape, NaN where it stays as guessed.
+        shape_std: (6,) standard deviations of the shape, NaN where it stays as guessed.
         misfit_px: standard deviation of the tracks where they fit no lens: what an estimate says is chance then;
             0 where they do.
         determined: whether the focal lengths are estimates, not the guess.
@@ -53,20 +64,29 @@ class LensEstimate:
         return renormalized(observations, self.guess, self.lens, group)
 
 
+def shape_sigmas(freedom: LensFreedom, width: float) -> Array:
+    """(4,) with which distortion and principal point are known beforehand; `width`: of what is seen, normalised."""
+    distortion = 0.0 if freedom in ("auto", "fixed", "focal") else _DISTORTION_SIGMA
+    center = _CENTER_SIGMA * width if freedom == "all" else 0.0
+    return np.array([distortion, distortion, center, center])
+
+
 def undistort(xy: Array, shape: Array) -> Array:
     """Inverse of `factors.distort`: (n, 2) undistorted coordinates, NaN where there are none."""
-    if not shape.any():
+    if not shape[DISTORTION].any():
         return xy
-    k1, k2, x, y = shape
+    k1, k2, x, y = shape[DISTORTION]
     camera = pycolmap.Camera(model="RADIAL", width=1, height=1, params=[1.0, x, y, k1, k2])
     return np.asarray(camera.cam_from_img(xy), np.float64)
 
 
 def renormalized(observations: Observations, before: Lens, after: Lens, group: Index) -> Observations:
     """The same pixels, undistorted by another lens; `group` as in `State`."""
-    seen = distort(observations.xy, before.shape)[0] if before.shape.any() else observations.xy
-    ratio = (before.focal / after.focal)[group[observations.frame], None]
-    return replace(observations, xy=undistort(seen * ratio, after.shape))
+    seen = distort(observations.xy, before.shape)[0] if before.bends else observations.xy
+    mine = group[observations.frame]
+    ratio = (before.focal / after.focal)[mine, None]
+    swept = observations.swept(before.shape[READOUT]) - observations.swept(after.shape[READOUT])
+    return replace(observations, xy=undistort(seen * ratio + swept / after.focal[mine, None], after.shape))
 
 
 def through(state: State, focal: Array) -> State:

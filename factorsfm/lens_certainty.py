@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.lens import DISTORTION
 from factorsfm.noise import block_inflation, image_cells
+from factorsfm.problem import LENS_SIZE
 from factorsfm.refinement import BundleAdjustment
 
 Array = NDArray[np.float64]
@@ -15,19 +17,22 @@ _CELLS = (6, 4)  # across and down, in which the errors of tracks may be alike
 _LEFT_OUT = (3, 2, 3)  # parts across, down and in time, of which one at a time is left out
 
 
-def lens_deviations(adjustment: BundleAdjustment, guess: Array | None = None) -> tuple[Array, Array, float]:
-    """(g + 4,) of log focal lengths and shape, NaN where held; and the evidence that the shape is not the guess.
+def lens_deviations(
+    adjustment: BundleAdjustment, guess: Array | None = None, part: slice = DISTORTION
+) -> tuple[Array, Array, float]:
+    """(g + 6,) of log focal lengths and shape, NaN where held; and the evidence that a part of the shape is no guess.
 
     First from the residuals, of whose covariances the most doubtful one counts, then from what parts of the shot say.
     """
     groups = len(adjustment.state.log_focal)
     covariances = [*lens_covariances(adjustment), _left_out_covariance(adjustment)]
-    std = np.full((len(covariances), groups + 4), np.nan)
+    std = np.full((len(covariances), groups + LENS_SIZE), np.nan)
     std[:, adjustment.free_lens] = np.sqrt([c.diagonal() for c in covariances])
     evidence = 0.0
     if guess is not None:
-        away = (adjustment.state.lens - guess)[adjustment.free_lens[groups:] - groups]
-        evidence = min(float(away @ np.linalg.solve(c[groups:, groups:], away)) for c in covariances)
+        free = np.isin(adjustment.free_lens, groups + np.arange(LENS_SIZE)[part])
+        away = (adjustment.state.lens - guess)[adjustment.free_lens[free] - groups]
+        evidence = min(float(away @ np.linalg.solve(c[np.ix_(free, free)], away)) for c in covariances)
     return std[:-1].max(0), std[-1], evidence
 
 

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.factors import distort
-from factorsfm.lens import Lens, LensEstimate, renormalized, through
+from factorsfm.lens import DISTORTION, READOUT, READOUT_SIGMA, Lens, LensEstimate, renormalized, shape_sigmas, through
 from factorsfm.lens_certainty import lens_deviations
 from factorsfm.lens_search import search_lens
 from factorsfm.noise import coordinate_sigma
 from factorsfm.observability import LEAST_GAIN, classify_motion, translation_gain
 from factorsfm.options import FOCAL_STD, TOLD_FOCAL_STD, Options, PolishOptions
-from factorsfm.problem import Observations, State
+from factorsfm.problem import LENS_SIZE, Observations, State
 from factorsfm.reconstruction import ShotKind
 from factorsfm.refinement import BundleAdjustment
 
@@ -26,8 +26,6 @@ logger = logging.getLogger(__name__)
 _CLEARLY = 0.9  # of the cost without distortion, at which the shot asks for some
 _TOLERANCE = 1e-5  # the focal length lies along a flat valley
 _OPEN_FOCAL_STD = 0.02  # like `FOCAL_STD`, with what a distortion that is not believed leaves open
-_DISTORTION_SIGMA = 0.1
-_CENTER_SIGMA = 0.02  # of the width
 _HELD_STD = 1e-6  # relative, of a focal length that is known
 _LARGEST_RATIO = 4.0  # of the focal length to its guess
 _MISFIT = 1.5  # of the standard deviation above which a solution is doubted
@@ -47,7 +45,7 @@ class _Solution:
 
     Attributes:
         moves: whether the camera does.
-        std, left_out: (g + 4,) of log focal lengths and shape, as in `lens_deviations`.
+        std, left_out: (g + 6,) of log focal lengths and shape, as in `lens_deviations`.
         known: whether the focal lengths count as determined.
     """
 
@@ -83,11 +81,10 @@ def estimate_lens(
     o = replace(options.polish, tolerance=_TOLERANCE)
     groups, width = len(guess.focal), float(np.ptp(adjustment.observations.xy, axis=0).max())
     held = not options.refine_focal_length
-    sigmas = {
-        "focal": np.zeros(4),
-        "distortion": np.array([_DISTORTION_SIGMA, _DISTORTION_SIGMA, 0.0, 0.0]),
-        "all": np.array([_DISTORTION_SIGMA, _DISTORTION_SIGMA, _CENTER_SIGMA * width, _CENTER_SIGMA * width]),
-    }["distortion" if held or options.lens == "zoom" else options.lens]
+    shutter = np.where(guess.shape[READOUT] != 0.0, READOUT_SIGMA, 0.0)
+    straight_sigmas = np.r_[np.zeros(4), shutter]
+    sigmas = np.r_[shape_sigmas(options.lens, width), shutter]
+    bends = bool(sigmas[DISTORTION].any())
     group = adjustment.state.group
 
     def seen_through(lens: Lens) -> tuple[State, Observations]:
@@ -99,17 +96,17 @@ def estimate_lens(
         focal_prior = np.log(guess.focal), np.eye(groups) / _HELD_STD**2
     else:
         first, cost = search_lens(adjustment, guess, o)
-        if sigmas.any():
+        if bends:
             bent, bent_cost = search_lens(adjustment, guess, o, sigmas)
             if not bent_cost < _CLEARLY * cost:
                 bent = None
     start, observations = seen_through(first)
-    straight, moves = _solved_as_it_moves(start, observations, o, adjustment.sigma, np.zeros(4), focal_prior)
+    straight, moves = _solved_as_it_moves(start, observations, o, adjustment.sigma, straight_sigmas, focal_prior)
     std, left_out, _ = lens_deviations(straight)
     best = _Solution(straight, moves, std, left_out, _largest(std, left_out, groups) < FOCAL_STD)
     # Strong distortion moves the valley of the focal length: a start without any does not lead there.
     starts = [(*seen_through(bent), adjustment.sigma, True)] if bent is not None else []
-    starts += [(straight.state, straight.observations, straight.sigma, moves)] if sigmas.any() else []
+    starts += [(straight.state, straight.observations, straight.sigma, moves)] if bends else []
     free = _with_free_shape(starts, o, sigmas, focal_prior)
     if free is not None:
         best = _judged_shape(best, free, guess, width)
@@ -120,7 +117,7 @@ def estimate_lens(
     logger.info("focal length %s pixels within %s %%, guess %s", lens.focal, 100 * focal_std, guess.focal)
     misfit = best.adjustment.sigma if best.adjustment.sigma > _MISFIT * o.doubtful_px else 0.0
     sound = not misfit and np.abs(np.log(lens.focal / guess.focal)).max() <= np.log(_LARGEST_RATIO)
-    known, rough, final = best.known and sound, False, lens
+    known, rough, final = best.known and bool(sound), False, lens
     if not known:
         # In a long valley a standard deviation says little.
         counts = sound and float(best.std[:groups].max()) < TOLD_FOCAL_STD
@@ -133,12 +130,12 @@ def estimate_lens(
     if final is not before:
         state, observations = through(state, final.focal), renormalized(observations, before, final, group)
     settled = BundleAdjustment(
-        replace(state, lens=np.zeros(4)), observations, options.polish,
+        replace(state, lens=np.zeros(LENS_SIZE)), observations, options.polish,
         sigma=best.adjustment.sigma if known or rough else adjustment.sigma,
     )  # fmt: skip
     settled.solve()
     return settled, LensEstimate(
-        guess, final, focal_std, shape_std if known or rough else np.full(4, np.nan), misfit, known, rough
+        guess, final, focal_std, shape_std if known or rough else np.full(LENS_SIZE, np.nan), misfit, known, rough
     )  # fmt: skip
 
 
@@ -161,7 +158,7 @@ def _judged_shape(straight: _Solution, free: tuple[BundleAdjustment, bool], gues
     if believed and std[:groups].max() < FOCAL_STD:
         return _Solution(full, moves, std, left_out, _largest(std, left_out, groups) < FOCAL_STD)
     # A distortion that is not believed may be there all the same: second moment around what is kept.
-    moved = np.append(full.state.log_focal - straight.adjustment.state.log_focal, np.full(4, np.nan))
+    moved = np.append(full.state.log_focal - straight.adjustment.state.log_focal, np.full(LENS_SIZE, np.nan))
     std, left_out = (
         np.fmax(kept, np.hypot(opened, moved)) for kept, opened in ((straight.std, std), (straight.left_out, left_out))
     )

@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 
 from factorsfm.lens import Lens, renormalized, through
 from factorsfm.options import PolishOptions
-from factorsfm.problem import Observations, State
+from factorsfm.problem import LENS_SIZE, Observations, State
 from factorsfm.refinement import BundleAdjustment
 
 Array = NDArray[np.float64]
 
 _FIELDS_OF_VIEW = np.radians(np.geomspace(20.0, 100.0, 8))  # across the longer side of what the tracks fill
 _SEARCH_FRAMES, _SEARCH_ITERATIONS, _PARABOLAS = 24, 15, 3
-_SHAPE_POWERS = np.array([2.0, 4.0, -1.0, -1.0])  # of the focal length in what displaces a pixel as far
+_SHAPE_POWERS = np.array([2.0, 4.0, -1.0, -1.0, 0.0, 0.0])  # of the focal length in what displaces a pixel as far
 
 
 def search_lens(
@@ -31,7 +31,7 @@ def search_lens(
     """
     state, few = _some_frames(adjustment.state, adjustment.observations)
     options = replace(options, iterations=_SEARCH_ITERATIONS, tolerance=1e-3)
-    known = np.zeros(4) if sigmas is None and guess.shape.any() else sigmas
+    known = np.zeros(LENS_SIZE) if sigmas is None and guess.shape.any() else sigmas
 
     def fit(near: State, factor: float) -> tuple[float, State]:
         focal = factor * guess.focal
@@ -86,6 +86,4 @@ def _some_frames(state: State, observations: Observations) -> tuple[State, Obser
         world=int(np.searchsorted(frames, state.world)),
     )
     frame, point = observations.frame[keep], observations.point[keep]
-    return part, Observations(
-        np.searchsorted(frames, frame), np.searchsorted(points, point), observations.xy[keep]
-    )  # fmt: skip
+    return part, observations.at(keep, frame=np.searchsorted(frames, frame), point=np.searchsorted(points, point))

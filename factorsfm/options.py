@@ -13,6 +13,7 @@ GUESSED_FOCAL_STD = 0.3  # of a focal length that nothing tells: fields of view 
 TOLD_FOCAL_STD = 0.05  # of one from EXIF data or a camera file that is to be refined
 
 LensFreedom = Literal["auto", "fixed", "focal", "radial", "distortion", "all", "zoom"]
+ShutterUse = Literal["auto", "global", "rolling"]
 DepthUse = Literal["none", "paper", "inverse"]
 
 
@@ -126,10 +127,15 @@ class Options:
             distortion, or also the principal point; "radial" is the distortion alone; "zoom" is "distortion" with a
             focal length for every frame, where the shot shows that it changes; "auto" is "fixed" for a given camera and
             "distortion" for none, "all" in an image set with much parallax.
+        shutter: what the polish of a video does with a rolling shutter that the shot shows. "auto": lens and points are
+            free of it, and poses are those with which a camera without one would show them most nearly as the recorded
+            images do; with control it is not looked for, since known poses mostly stem from what knows none. "rolling":
+            poses are those of the moment at which the middle of the image is read. "global": it is not looked for.
     """
 
     preset: str = "default"
     lens: LensFreedom = "auto"
+    shutter: ShutterUse = "auto"
     tracker: TrackerOptions = field(default_factory=TrackerOptions)
     mapper: MapperOptions = field(default_factory=MapperOptions)
     polish: PolishOptions = field(default_factory=PolishOptions)

@@ -13,6 +13,7 @@ from factorsfm.control import LocatedControl
 from factorsfm.controlled import controlled, frames_under_control
 from factorsfm.errors import ReconstructionError
 from factorsfm.evaluation.alignment import Similarity
+from factorsfm.factors import cauchy
 from factorsfm.images import MappedImage, gather, seen_by
 from factorsfm.joined import joined_frames
 from factorsfm.lens import Lens, LensEstimate
@@ -26,6 +27,7 @@ from factorsfm.problem import Observations, State
 from factorsfm.reconstruction import CameraObservability, ControlFit, ShotKind
 from factorsfm.refinement import BundleAdjustment
 from factorsfm.registration import register_image
+from factorsfm.rolling_shutter import Recording, Shutter, seen_at_once, with_sweep
 from factorsfm.track_errors import TrackErrors, measure_track_errors
 
 Array = NDArray[np.float64]
@@ -48,6 +50,8 @@ class Polished:
         point_std: (n,) standard deviations of the inverse distances, in the same unit.
         left_out: why, of the registered images that have no pose here.
         lens: what became of an unknown lens, None where it is known.
+        shutter: a rolling shutter, None where the shot shows none; recorded: whether poses and observations are those
+            of the recorded images all the same, see `Options.shutter`.
         datum, control: from this world to that of the control, and what the control did; None without control.
         control_unused: whether there is control that could not take part.
     """
@@ -65,6 +69,8 @@ class Polished:
     left_out: dict[int, str]
     prior: PriorPart | None = None
     lens: LensEstimate | None = None
+    shutter: Shutter | None = None
+    recorded: bool = False
     datum: Similarity | None = None
     control: ControlFit | None = None
     control_unused: bool = False
@@ -80,6 +86,7 @@ def polish(
     groups: Index | None = None,
     control: LocatedControl | None = None,
     first_focal: tuple[Array, float] | None = None,
+    recording: Recording | None = None,
 ) -> Polished:
     """Triangulate all tracks and minimise over all registered frames.
 
@@ -92,6 +99,8 @@ def polish(
         shape: (4,) distortion of the lens as in `factors.distort` where the options refine the lens; None is none.
         groups: (images,) which of the focal lengths is that of each image; None: all have the first.
         first_focal: what was thought of the focal lengths first, as in `estimate_lens`; None: `focal`.
+        recording: of which the images are all, if their rows may have been read one after another; None: all at once,
+            or in no order of time.
         control: what is known beforehand, its marks normalised as the tracks are; it takes part at the end, and only
             where the camera moves.
 
@@ -102,7 +111,7 @@ def polish(
     o, least = options.polish, options.mapper.min_inliers
     registered = [i for i, image in enumerate(images) if image.registered]
     groups = np.zeros(len(images), np.int64) if groups is None else groups
-    guess = Lens(focal, np.zeros(4) if shape is None else shape)
+    guess = Lens(focal) if shape is None else Lens(focal, np.r_[shape, np.zeros(2)])
     left_out: dict[int, str] = {}
     while True:
         frames = _solved_frames(images, registered, o.max_frames)
@@ -110,6 +119,8 @@ def polish(
             frames = sorted({*frames, *frames_under_control(registered, control, o.max_frames // 2)})
         used = [images[i] for i in frames]
         observations, tracks = _gather(used, min(o.min_track_length, max(2, len(used))))
+        if recording is not None:
+            observations = with_sweep(observations, tracks, images, frames, guess, groups[frames], recording)
         unheld = _unheld(observations, frames, least)
         if not unheld:
             group = groups[frames]
@@ -167,7 +178,7 @@ def polish(
     result = Polished(
         frames, adjustment.state, tracks, observations, adjustment.reprojection_errors(), sigma,
         known.motion, pose_blocks(camera_covariance, k), observability,
-        marginals.inverse_distance_std(camera_covariance), left_out, prior, lens,
+        marginals.inverse_distance_std(camera_covariance), left_out, prior, lens, known.shutter,
     )  # fmt: skip
     result.control_unused = control is not None and not free
     if control is not None and free:
@@ -180,7 +191,9 @@ def polish(
             group, lens = np.arange(len(registered)), _between(lens, frames, np.array(registered))
             solved = np.searchsorted(registered, frames)
             result.state, result.lens = replace(result.state, log_focal=np.log(lens.lens.focal), group=solved), lens
-        _add_frames_between(result, images, registered, group, options)
+        _add_frames_between(result, images, registered, group, options, recording)
+    if result.shutter is not None and options.shutter == "auto":
+        _fit_to_recorded_images(result, result.shutter, o)
     return result
 
 
@@ -217,6 +230,17 @@ def _put_under_control(result: Polished, adjustment: BundleAdjustment, control: 
         result.prior.scale_std, result.prior.shift_std = affine[::2], affine[1::2]
 
 
+def _fit_to_recorded_images(result: Polished, shutter: Shutter, options: PolishOptions) -> None:
+    """What agrees with the rolling shutter, seen by cameras without one."""
+    recorded = shutter.recorded(result.observations, result.state)
+    weight = cauchy(result.errors[:, None] / result.sigma, options.kernel)[1]
+    result.state = replace(seen_at_once(result.state, recorded, weight), world=-1).seen_from(0)
+    result.observations, result.recorded = recorded, True
+    result.errors = BundleAdjustment(
+        result.state, recorded, options, sigma=result.sigma
+    ).reprojection_errors()  # fmt: skip
+
+
 def _gather(images: list[MappedImage], min_length: int) -> tuple[Observations, Index]:
     """Observations of all tracks that are long enough, sorted by track, and the tracks' ids."""
     ids = seen_by(images, min_length)
@@ -249,13 +273,20 @@ def _between(lens: LensEstimate, frames: list[int], wanted: Index) -> LensEstima
 
 
 def _add_frames_between(
-    result: Polished, images: list[MappedImage], registered: list[int], group: Index, options: Options
+    result: Polished,
+    images: list[MappedImage],
+    registered: list[int],
+    group: Index,
+    options: Options,
+    recording: Recording | None,
 ) -> None:
     """Register the frames that were left out on the polished points; `group`: of each registered frame."""
     state, m = result.state, options.mapper
     seen = gather([images[f] for f in registered], result.tracks)
-    if result.lens is not None:
-        seen = result.lens.renormalize(seen, group)
+    if (change := result.lens or result.shutter) is not None:
+        if recording is not None:
+            seen = with_sweep(seen, result.tracks, images, registered, change.guess, group, recording)
+        seen = change.renormalize(seen, group)
     by_frame = {f: np.nonzero(seen.frame == k)[0] for k, f in enumerate(registered)}
     focal = dict(zip(registered, np.exp(state.log_focal)[group].tolist(), strict=True))
     solved = np.array(result.frames)
@@ -298,7 +329,7 @@ def _add_frames_between(
     result.frames = frames
     kept = np.isin(np.array(registered)[seen.frame], frames)
     rows = np.searchsorted(frames, np.array(registered)[seen.frame[kept]])
-    result.observations = Observations(rows, seen.point[kept], seen.xy[kept])
+    result.observations = seen.at(kept, frame=rows)
     result.errors = BundleAdjustment(
         result.state, result.observations, options.polish, sigma=result.sigma
     ).reprojection_errors()

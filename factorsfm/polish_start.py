@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.converge import converge_cameras, core_tracks
+from factorsfm.converge import converge, converge_cameras, core_tracks
 from factorsfm.images import MappedImage
 from factorsfm.lens import Lens, LensEstimate
 from factorsfm.lens_estimate import estimate_lens
@@ -19,6 +19,7 @@ from factorsfm.prior_term import WeighedPrior, weigh_prior
 from factorsfm.problem import Observations, State
 from factorsfm.reconstruction import ShotKind
 from factorsfm.refinement import BundleAdjustment
+from factorsfm.rolling_shutter import Shutter, find_shutter
 from factorsfm.triangulation import Triangulation, triangulate
 from factorsfm.zoom import find_zoom
 
@@ -36,7 +37,7 @@ class PolishStart:
     Attributes:
         state: of cameras and tracks; observations, tracks: that belong together, undistorted by the lens.
         sigma: of the tracks that hold the cameras, pixels; inflation: of its square, since errors repeat themselves.
-        prior: with the weight it earns; lens: see `Polished`.
+        prior: with the weight it earns; lens, shutter: see `Polished`.
     """
 
     state: State
@@ -47,6 +48,7 @@ class PolishStart:
     motion: Motion
     prior: WeighedPrior | None
     lens: LensEstimate | None
+    shutter: Shutter | None
 
 
 def polish_start(
@@ -75,11 +77,17 @@ def polish_start(
     few = observations.of(core)
     start = _first_guess(images, few, tracks[core], map_points, guess.focal, group, _world(observations))
     kept, adjustment = converge_cameras(start, few, options)
-    core, few, lens = core[kept], adjustment.observations, None
+    core, few, lens, seen = core[kept], adjustment.observations, None, guess
+    shutter = find_shutter(adjustment, guess, options) if few.sweep is not None else None
+    if shutter is not None:
+        seen = shutter.lens
+        adjustment = converge(adjustment.state, shutter.renormalize(few, group), options)
     if options.estimates_lens:
-        adjustment, lens = _estimate_lens(adjustment, guess, frames, options, first_focal)
-        few = adjustment.observations
-        observations = lens.renormalize(observations, adjustment.state.group)
+        adjustment, lens = _estimate_lens(adjustment, seen, frames, options, first_focal)
+        lens = replace(lens, guess=replace(lens.guess, shape=guess.shape))
+        shutter = shutter and shutter.known_with(lens)
+    if (change := lens or shutter) is not None:
+        few, observations = adjustment.observations, change.renormalize(observations, adjustment.state.group)
     motion = classify_motion(adjustment, few, o)
     inflation = block_inflation(adjustment.reprojection_vectors(), few)
     prior, part = None, motion.rotation_only
@@ -97,7 +105,7 @@ def polish_start(
     else:
         limit = o.observation_sigmas * sigma
         observations, tracks, state = _without_outlying_observations(state, observations, tracks, limit, o)
-    return PolishStart(state, observations, tracks, sigma, inflation, motion, prior, lens)
+    return PolishStart(state, observations, tracks, sigma, inflation, motion, prior, lens, shutter)
 
 
 def _first_guess(
@@ -143,7 +151,7 @@ def _triangulated(cameras: State, observations: Observations, points: Index, fal
     return triangulate(
         cameras.rotation,
         cameras.translation,
-        Observations(o.frame[few], o.point[few], o.xy[few]),
+        o.at(few),
         focal=float(np.median(cameras.focal)),
         inlier_px=5.0,
         sigma=FIRST_SIGMA_PX,
@@ -216,5 +224,4 @@ def _without_outlying_observations(
     good = BundleAdjustment(state, observations, options, sigma=1.0).reprojection_errors() < limit_px
     good &= np.bincount(observations.point, good, len(tracks))[observations.point] >= 2
     keep = np.unique(observations.point[good])
-    o = observations
-    return Observations(o.frame[good], o.point[good], o.xy[good]).of(keep), tracks[keep], state.of(keep)
+    return observations.at(good).of(keep), tracks[keep], state.of(keep)

@@ -12,6 +12,37 @@ from factorsfm.factors import camera_points
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
+LENS_SIZE = 6  # of `State.lens`
+
+
+@dataclass(frozen=True, slots=True)
+class Sweep:
+    """How m observations move in the image while it is read out, see `rolling_shutter`.
+
+    Attributes:
+        motion, acceleration: (m, 2) when it is read, pixels per frame, and per frame squared.
+        place: (m, 2) columns and rows from the principal point, in widths and heights of the image: an observation is
+            read at the time ``place @ readout``, in frames, from that of its pose.
+    """
+
+    motion: Array
+    acceleration: Array
+    place: Array
+
+    def of(self, rows: NDArray[np.bool_] | Index) -> Sweep:
+        """That of some of the observations."""
+        return Sweep(self.motion[rows], self.acceleration[rows], self.place[rows])
+
+    def displacement(self, readout: Array) -> Array:
+        """(m, 2) pixels, for a readout (2,) along columns and rows."""
+        time = (self.place @ readout)[:, None]
+        return np.asarray(time * (self.motion - 0.5 * time * self.acceleration))
+
+    def by_readout(self, readout: Array) -> Array:
+        """(m, 2, 2) derivative of the displacement."""
+        velocity = self.motion - (self.place @ readout)[:, None] * self.acceleration
+        return np.asarray(velocity[:, :, None] * self.place[:, None, :])
+
 
 @dataclass(frozen=True, slots=True)
 class Observations:
@@ -20,11 +51,13 @@ class Observations:
     Attributes:
         frame, point: (m,) indices.
         xy: (m, 2) undistorted normalised image coordinates.
+        sweep: how each moves while the image is read out; None where that is not known.
     """
 
     frame: Index
     point: Index
     xy: Array
+    sweep: Sweep | None = None
 
     @property
     def first(self) -> Index:
@@ -38,8 +71,25 @@ class Observations:
 
     def of(self, points: Index) -> Observations:
         """Those of some points (ascending), renumbered."""
-        keep = np.isin(self.point, points)
-        return Observations(self.frame[keep], np.searchsorted(points, self.point[keep]), self.xy[keep])
+        rows = np.isin(self.point, points)
+        return self.at(rows, point=np.searchsorted(points, self.point[rows]))
+
+    def at(
+        self, rows: NDArray[np.bool_] | Index, *, frame: Index | None = None, point: Index | None = None
+    ) -> Observations:
+        """Some of them, or all in another order, where asked for with other indices."""
+        return Observations(
+            self.frame[rows] if frame is None else frame,
+            self.point[rows] if point is None else point,
+            self.xy[rows],
+            None if self.sweep is None else self.sweep.of(rows),
+        )
+
+    def swept(self, readout: Array) -> Array:
+        """(m, 2) by how far each has moved when it is read out (pixels); `readout`: as in `State.lens`."""
+        if self.sweep is None or not readout.any():
+            return np.zeros((1, 2))
+        return self.sweep.displacement(readout)
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,10 +123,11 @@ class State:
 
     Attributes:
         rotation (k, 3, 3), translation (k, 3): `cam_from_world`.
-        world: the frame whose camera is the world.
+        world: the frame whose camera is the world, -1 for none.
         bearing (n, 3) unit, inverse_distance (n,): points seen from the world's origin.
         log_focal: (g,) logarithms of the focal lengths in pixels.
-        lens: (4,) distortion and principal point as in `factors.distort`, where they are estimated.
+        lens: (6,) where they are estimated: distortion and principal point as in `factors.distort`, and the readout as
+            in `rolling_shutter`.
         group: (k,) which of the focal lengths is that of each frame; by default all have the first.
         scale, shift: (images,) affine of each image with a prior.
         control: datum and marked points, see `control_term`; empty without control.
@@ -88,7 +139,7 @@ class State:
     bearing: Array
     inverse_distance: Array
     log_focal: Array
-    lens: Array = field(default_factory=lambda: np.zeros(4))
+    lens: Array = field(default_factory=lambda: np.zeros(LENS_SIZE))
     group: Index = field(default_factory=lambda: np.zeros(0, np.int64))
     scale: Array = field(default_factory=lambda: np.zeros(0))
     shift: Array = field(default_factory=lambda: np.zeros(0))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,6 +102,24 @@ class LensFit:
     cx_std: float | None = None
     cy_std: float | None = None
     zoom_std: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class RollingShutter:
+    """A shutter with which the rows of an image are read one after another.
+
+    Attributes:
+        readout: share of the time between two frames that passes from the first row to the last; negative where the
+            last one is read first. std: its standard deviation.
+        along: "rows" from top to bottom, or "columns" from left to right, as in images that were turned upright.
+        recorded: whether the poses are those with which a camera without it would show the points most nearly as the
+            recorded images do; otherwise those of the moment when the middle of the image is read.
+    """
+
+    readout: float
+    std: float
+    along: Literal["rows", "columns"]
+    recorded: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,6 +252,7 @@ class Reconstruction:
     parallax: float
     point_std: NDArray[np.float64] | None = None
     lens: LensFit | None = None
+    shutter: RollingShutter | None = None
     metric: bool = False
     control: ControlFit | None = None
     notes: list[str] = field(default_factory=list)

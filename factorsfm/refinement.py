@@ -19,7 +19,7 @@ from factorsfm.elimination import Block, Elimination, Normal, Term, conditioned,
 from factorsfm.factors import affine_inverse_depth, by_pose, cauchy, cross_matrices, distort, reprojection
 from factorsfm.marginals import Marginals, tangent_basis
 from factorsfm.options import PolishOptions
-from factorsfm.problem import Observations, PriorObservations, State
+from factorsfm.problem import LENS_SIZE, Observations, PriorObservations, State
 from factorsfm.track_errors import TrackErrors
 
 Array = NDArray[np.float64]
@@ -46,8 +46,8 @@ class BundleAdjustment:
         free_focal: whether the focal lengths are estimated.
         focal_prior: (g,) mean and (g, g) information matrix with which the logarithms of the focal lengths are known
             beforehand; None: not at all.
-        lens_sigmas: (4,) standard deviations with which `State.lens` is known beforehand (0: exactly); None: it is
-            zero, the observations are undistorted. lens_mean: (4,) around what; None: around the state's.
+        lens_sigmas: (6,) standard deviations with which `State.lens` is known beforehand (0: exactly); None: it is
+            zero, the observations are undistorted. lens_mean: (6,) around what; None: around the state's.
         points_only: True holds everything but the points fixed.
         fixed: (k,) frames whose poses are held; by default the one that is the world. Those without observations are
             held as well.
@@ -94,10 +94,12 @@ class BundleAdjustment:
         self._lens_mean = state.lens if lens_mean is None else lens_mean
         seen = observations.xy if lens_sigmas is None else distort(observations.xy, state.lens)[0]
         self._pixels = seen * self._focal(state)[:, None]  # what was measured, whatever the lens
+        if lens_sigmas is not None:
+            self._pixels += observations.swept(state.lens[4:])
         frames, images, nodes = len(state.rotation), len(state.scale), len(state.field)
         self._lens = 6 * frames
         self._shape = self._lens + len(state.log_focal)
-        self._affine = self._shape + (0 if lens_sigmas is None else 4)
+        self._affine = self._shape + (0 if lens_sigmas is None else LENS_SIZE)
         self._field = self._affine + 2 * images
         self._control = self._field + nodes
         self._columns = self._control + len(state.control)
@@ -152,22 +154,28 @@ class BundleAdjustment:
         residual, by_q = reprojection(q, self._pixels, focal)
         if self._lens_sigmas is not None:
             uv, by_uv, _ = distort(q[:, :2] / q[:, 2:], state.lens)
-            residual, by_q = focal[:, None] * uv - self._pixels, by_uv @ by_q
+            residual = focal[:, None] * uv - self._pixels + o.swept(state.lens[4:])
+            by_q = by_uv @ by_q
         by_q[behind] = 0.0
         return residual / self.sigma, by_q / self.sigma, q
 
     def _by_lens(self, residual: Array, q: Array) -> Array:
         """(m, 2, c) derivative of the residuals by the columns of the lens: focal length of the frame, shape."""
-        by_focal = (residual + self._pixels / self.sigma)[:, :, None]  # d r / d log f is the prediction
+        measured = self._pixels - self.observations.swept(self.state.lens[4:])
+        by_focal = (residual + measured / self.sigma)[:, :, None]  # d r / d log f is the prediction
         if self._lens_sigmas is None:
             return np.asarray(by_focal)
         by_lens = distort(q[:, :2] / q[:, 2:], self.state.lens)[2]
         by_lens *= (self._focal(self.state) / self.sigma)[:, None, None]
-        return np.concatenate([by_focal, by_lens], 2)
+        sweep = self.observations.sweep
+        by_readout = np.zeros((len(q), 2, 2))
+        if sweep is not None:
+            by_readout = sweep.by_readout(self.state.lens[4:]) / self.sigma
+        return np.concatenate([by_focal, by_lens, by_readout], 2)
 
     def _lens_prior(self, state: State) -> tuple[Array, Array]:
         """Differences to what is known of the lens, and the information; none of it where nothing is estimated."""
-        sigmas = np.zeros(4) if self._lens_sigmas is None else self._lens_sigmas
+        sigmas = np.zeros(LENS_SIZE) if self._lens_sigmas is None else self._lens_sigmas
         free = sigmas > 0
         return np.where(free, state.lens - self._lens_mean, 0.0), np.where(free, sigmas, np.inf) ** -2.0
 
@@ -296,7 +304,7 @@ class BundleAdjustment:
         rows = rows & (np.bincount(o.point, rows)[o.point] >= 2)
         points, point = np.unique(o.point[rows], return_inverse=True)
         part = BundleAdjustment(
-            self.state.of(points), Observations(o.frame[rows], point, o.xy[rows]), self.options,
+            self.state.of(points), o.at(rows, point=point), self.options,
             sigma=self.sigma, **self._freedom,
         )  # fmt: skip
         part._anchor, part._point_sigma = self._anchor[points], self._point_sigma
@@ -333,7 +341,7 @@ class BundleAdjustment:
     def _retract(self, camera: Array, point: Array) -> State:
         s = self.state
         pose = camera[: self._lens].reshape(-1, 6)
-        turn = _exponential(-pose[:, :3])
+        turn = exponential(-pose[:, :3])
         log_focal = camera[self._lens : self._shape]
         by_lens = float(log_focal[s.group[s.world]])
         # A new focal length moves the points along, so that the world's camera sees them where it did: what the step
@@ -441,7 +449,7 @@ class BundleAdjustment:
         return -moved
 
 
-def _exponential(rotation_vector: Array) -> Array:
+def exponential(rotation_vector: Array) -> Array:
     """(n, 3, 3) rotation matrices of (n, 3) rotation vectors."""
     angle = np.linalg.norm(rotation_vector, axis=1)[:, None, None]
     hat = cross_matrices(rotation_vector)

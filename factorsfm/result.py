@@ -13,11 +13,20 @@ from factorsfm.camera import with_focal, with_lens
 from factorsfm.controlled import control_notes
 from factorsfm.evaluation.alignment import Similarity
 from factorsfm.images import MappedImage
-from factorsfm.lens import LensEstimate
+from factorsfm.lens import DISTORTION, LensEstimate
 from factorsfm.observability import observability_notes
 from factorsfm.polish import Polished
 from factorsfm.problem import State
-from factorsfm.reconstruction import FrameResult, FrameStatus, LensFit, PriorFit, Reconstruction, ShotKind
+from factorsfm.reconstruction import (
+    FrameResult,
+    FrameStatus,
+    LensFit,
+    PriorFit,
+    Reconstruction,
+    RollingShutter,
+    ShotKind,
+)
+from factorsfm.rolling_shutter import Shutter
 
 Array = NDArray[np.float64]
 
@@ -67,14 +76,17 @@ def assemble(
         notes.append(
             f"The focal length is {origin} ({pixels_long}): no camera was given, and the lens was to stay fixed."
         )
+    shutter = _rolling_shutter(polished.shutter, recorded=polished.recorded) if polished.shutter is not None else None
+    if shutter is not None:
+        notes.append(_shutter_note(shutter, frames))
     scale = _metric_scale(polished, images) if metric else None
     if polished.datum is not None:
         scale = polished.datum.scale
     unit = scale or 1.0
     lens = polished.lens
     if lens is not None:
-        focal, shape = float(np.median(state.focal)), lens.lens.shape
-        camera = with_lens(camera, focal, shape) if shape.any() else with_focal(camera, focal)
+        focal = float(np.median(state.focal))
+        camera = with_lens(camera, focal, lens.lens.shape) if lens.lens.bends else with_focal(camera, focal)
     kept, row_of = _usable_points(polished)
     observations = polished.observations
     keep = row_of[observations.point] >= 0
@@ -112,6 +124,7 @@ def assemble(
         parallax=_parallax(state),
         point_std=polished.point_std[kept] / state.inverse_distance[kept] if general else None,
         lens=_lens_fit(lens) if lens is not None else None,
+        shutter=shutter,
         metric=scale is not None,
         control=polished.control,
         notes=notes,
@@ -270,7 +283,26 @@ def _lens_note(estimate: LensEstimate) -> str:
     return f"{note}.{zoom}"
 
 
+def _rolling_shutter(shutter: Shutter, *, recorded: bool) -> RollingShutter:
+    columns, rows = shutter.readout.tolist()
+    return RollingShutter(rows or columns, shutter.std, "rows" if rows else "columns", recorded)
+
+
+def _shutter_note(shutter: RollingShutter, frames: Sequence[SeenFrame]) -> str:
+    way = ("top", "bottom") if shutter.along == "rows" else ("left", "right")
+    first, last = way if shutter.readout > 0 else way[::-1]
+    times = [frame.timestamp for frame in frames if frame.timestamp is not None]
+    interval = float(np.median(np.diff(times))) if len(times) == len(frames) else 0.0
+    milliseconds = f" ({1e3 * abs(shutter.readout) * interval:.1f} ms)" if interval > 0 else ""
+    poses = "fit the recorded images" if shutter.recorded else "are those of the image's middle"
+    return (
+        f"Rolling shutter: images are read from {first} to {last} in {abs(shutter.readout):.2f} ± "
+        f"{shutter.std:.2f} of the time between two frames{milliseconds}. Lens and points are free of it; "
+        f"poses {poses}."
+    )
+
+
 def _lens_fit(estimate: LensEstimate) -> LensFit:
-    k1, k2, x, y = (float(std) if np.isfinite(std) else None for std in estimate.shape_std)
+    k1, k2, x, y = (float(std) if np.isfinite(std) else None for std in estimate.shape_std[DISTORTION])
     focal_std = float(estimate.focal_std.max()) if estimate.determined or estimate.rough else 0.0
     return LensFit(estimate.determined, focal_std or None, k1, k2, x, y, estimate.zoom_std)

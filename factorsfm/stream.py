@@ -43,6 +43,7 @@ from factorsfm.reconstruction import FrameResult, FrameStatus, Reconstruction
 from factorsfm.registration import ImageDepth
 from factorsfm.report.thumbnails import Thumbnails
 from factorsfm.result import assemble
+from factorsfm.rolling_shutter import Recording
 from factorsfm.snapshot import read_snapshot, write_snapshot
 from factorsfm.threads import OneThreadEach
 from factorsfm.tracks.colors import TrackColors
@@ -283,6 +284,7 @@ class Stream(Closing):
                 lens_shape(self.camera) if self.options.estimates_lens else None,
                 control=control,
                 first_focal=(np.array([mapper.first_focal]), self._first_focal_std),
+                recording=self._recording(),
             )
         reconstruction = assemble(
             result,
@@ -310,6 +312,13 @@ class Stream(Closing):
         """How well the focal length was known at first."""
         assert self.camera is not None
         return TOLD_FOCAL_STD if self._lens_given or self.camera.has_prior_focal_length else GUESSED_FOCAL_STD
+
+    def _recording(self) -> Recording | None:
+        """What a rolling shutter is looked for in."""
+        shutter = self.options.shutter
+        if shutter == "global" or (shutter == "auto" and self.control is not None):
+            return None
+        return Recording(*self._size, np.array([frame.index for frame in self.frames]))
 
     def _located_control(self) -> LocatedControl | None:
         if self.control is None:

@@ -97,7 +97,7 @@ def run(arguments: argparse.Namespace, progress: Progress, show: Show) -> str:
     camera = open_camera(arguments.camera)
     frames = parse_range(arguments.frames) if arguments.frames is not None else None
     raw = RawFormat.parse(arguments.raw) if arguments.raw else None
-    options = replace(Options.preset_named(arguments.preset), lens=arguments.lens)
+    options = replace(Options.preset_named(arguments.preset), lens=arguments.lens, shutter=arguments.shutter)
     depth = open_depth(unless_none(arguments.depth), arguments.depth_kind) if options.uses_depth else None
     masks = open_masks(unless_none(arguments.masks))
     with open_viewer(arguments.viewer, arguments.record) as viewer:

@@ -49,6 +49,7 @@ def summary(reconstruction: Reconstruction) -> dict[str, Any]:
         "focal_range": focal_range(reconstruction),
         "camera": camera_to_json(reconstruction.camera),
         "lens": reconstruction.lens and asdict(reconstruction.lens),
+        "shutter": reconstruction.shutter and asdict(reconstruction.shutter),
         "seconds": with_total(reconstruction.seconds),
         "notes": reconstruction.notes,
         "parts": 1 + len(reconstruction.others),

@@ -13,7 +13,7 @@ from factorsfm.lens_certainty import lens_covariances
 from factorsfm.lens_estimate import solved_with_lens
 from factorsfm.observability import LEAST_GAIN, translation_gain
 from factorsfm.options import PolishOptions
-from factorsfm.problem import Observations, State
+from factorsfm.problem import LENS_SIZE, Observations, State
 from factorsfm.refinement import BundleAdjustment
 
 Array = NDArray[np.float64]
@@ -71,7 +71,7 @@ def find_zoom(known: BundleAdjustment, guess: Lens, times: Array, options: Polis
     )
     few = replace(options, iterations=_FLAT_ITERATIONS)
     prior = own.log_focal, _information(times, _FIRST_SPREAD) + _level(count, _TURNING_LEVEL_SIGMA)
-    turning = solved_with_lens(flat, known.observations, few, 1.0, np.zeros(4), moves=False, focal_prior=prior)
+    turning = solved_with_lens(flat, known.observations, few, 1.0, np.zeros(LENS_SIZE), moves=False, focal_prior=prior)
     mean = own.log_focal
     turning, turning_spread = _solved(
         turning.state, turning.observations, known.sigma, mean, times, options, moves=False
@@ -125,7 +125,9 @@ def _solved(
     bend, spread, level = _bend(times), _FIRST_SPREAD, _MOVING_LEVEL_SIGMA if moves else _TURNING_LEVEL_SIGMA
     for _ in range(_ROUNDS):
         prior = mean, _information(times, spread) + _level(len(times), level)
-        problem = solved_with_lens(state, observations, options, sigma, np.zeros(4), moves=moves, focal_prior=prior)
+        problem = solved_with_lens(
+            state, observations, options, sigma, np.zeros(LENS_SIZE), moves=moves, focal_prior=prior
+        )
         state, observations, sigma = problem.state, problem.observations, problem.sigma
         uncertain = (bend @ lens_covariances(problem)[0] @ bend.T).diagonal()
         spread = max(float(np.sqrt(np.mean((bend @ state.log_focal) ** 2 + uncertain))), _LEAST_SPREAD)

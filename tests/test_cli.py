@@ -63,6 +63,7 @@ def test_reconstruct_writes_the_result(
         "masks": None,
         "frames": None,
         "lens": "auto",
+        "shutter": "auto",
         "control": None,
         "preset": "default",
         "unordered": None,

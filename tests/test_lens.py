@@ -20,22 +20,22 @@ from factorsfm.lens_search import search_lens
 from factorsfm.noise import image_cells
 from factorsfm.options import FOCAL_STD, TOLD_FOCAL_STD, Options, PolishOptions
 from factorsfm.polish import polish
-from factorsfm.problem import Observations
+from factorsfm.problem import LENS_SIZE, Observations, Sweep
 from factorsfm.reconstruction import ShotKind
 from factorsfm.refinement import BundleAdjustment
 from factorsfm.result import _lens_note
 
-BARREL = np.array([-0.15, 0.02, 0.0, 0.0])
-STRONG_BARREL = np.array([-0.3, 0.08, 0.0, 0.0])
+BARREL = np.array([-0.15, 0.02, 0.0, 0.0, 0.0, 0.0])
+STRONG_BARREL = np.array([-0.3, 0.08, 0.0, 0.0, 0.0, 0.0])
 
 
 def estimated(problem, *, guess=1.3, shape=None, lens="distortion", first_std=None):
     """The polish of a problem whose lens has a shape, from tracks that a guess normalised without it."""
-    truth = Lens(np.array([problem.focal]), np.zeros(4))
+    truth = Lens(np.array([problem.focal]))
     seen = replace(
         problem.observations, xy=distort(problem.observations.xy, np.zeros(4) if shape is None else shape)[0]
     )
-    wrong = Lens(guess * truth.focal, np.zeros(4))
+    wrong = Lens(guess * truth.focal)
     start = through(problem.truth, wrong.focal)
     images = mapped_images(replace(problem, observations=renormalized(seen, truth, wrong, start.group)), start)
     points = np.arange(len(start.bearing)), start.points
@@ -67,13 +67,15 @@ def test_the_gradient_of_the_lens_columns_is_that_of_the_cost(kernel, group):
     groups = max(group) + 1
     focal = problem.truth.log_focal + 0.02 * np.arange(groups)
     start = replace(
-        problem.truth, lens=np.array([-0.1, 0.05, 0.003, 0.002]), log_focal=focal, group=np.array(group)
+        problem.truth, lens=np.array([-0.1, 0.05, 0.003, 0.002, 0.1, 0.4]), log_focal=focal, group=np.array(group)
     )  # fmt: skip
     information = np.cov(np.random.default_rng(0).standard_normal((groups, 9))).reshape(groups, groups)
-    sigmas = np.array([0.1, 0.1, 0.02, 0.02])
+    sigmas = np.array([0.1, 0.1, 0.02, 0.02, 1.0, 1.0])
     options = PolishOptions(kernel=kernel)
+    random = np.random.default_rng(1).standard_normal((3, len(problem.observations.xy), 2))
+    observations = replace(problem.observations, sweep=Sweep(20.0 * random[0], 5.0 * random[1], random[2]))
     adjustment = BundleAdjustment(
-        start, problem.observations, options, sigma=0.5, free_focal=True, lens_sigmas=sigmas,
+        start, observations, options, sigma=0.5, free_focal=True, lens_sigmas=sigmas,
         focal_prior=(focal + 0.1, information),
     )  # fmt: skip
     adjustment.state = replace(
@@ -81,7 +83,7 @@ def test_the_gradient_of_the_lens_columns_is_that_of_the_cost(kernel, group):
     )
     normal = adjustment._linearize()
     lens = 6 * problem.frames
-    size = lens + groups + 4
+    size = lens + groups + LENS_SIZE
     assert len(normal.camera_gradient) == size
 
     def slope(column):
@@ -113,8 +115,8 @@ def test_a_new_focal_length_leaves_the_first_image_as_it_is():
 def test_the_lenses_of_several_cameras_are_found():
     problem = make_problem("arc", frames=10, points=200, parallax=0.3, noise_px=0.05)
     groups = np.array([0, 0, 1, 1, 2, 2, 1, 0, 2, 1])
-    truth = Lens(problem.focal * np.array([1.0, 1.0, 1.0]), np.zeros(4))
-    wrong = Lens(problem.focal * np.array([1.3, 1.15, 1.4]), np.zeros(4))
+    truth = Lens(problem.focal * np.array([1.0, 1.0, 1.0]))
+    wrong = Lens(problem.focal * np.array([1.3, 1.15, 1.4]))
     start = through(problem.truth, np.array([1.3 * problem.focal]))
     images = mapped_images(
         replace(problem, observations=renormalized(problem.observations, truth, wrong, groups)), start
@@ -181,7 +183,7 @@ def test_errors_as_long_as_a_track_lives_count_once():
         speed = 0.3 * np.random.default_rng(seed).standard_normal((len(problem.points), 2)) / problem.focal
         slid = o.xy + speed[o.point] * (o.frame / problem.frames)[:, None]
         adjustment = solved_with_lens(
-            problem.truth, replace(o, xy=slid), PolishOptions(tolerance=1e-6), 0.1, np.zeros(4)
+            problem.truth, replace(o, xy=slid), PolishOptions(tolerance=1e-6), 0.1, np.zeros(LENS_SIZE)
         )  # fmt: skip
         std = np.sqrt(max(c[0, 0] for c in lens_covariances(adjustment)))
         off.append((adjustment.state.log_focal[0] - np.log(problem.focal)) / std)
@@ -193,7 +195,7 @@ def test_what_is_left_out_tells_as_much_as_independent_errors_do():
     for seed in range(6):
         problem = make_problem("arc", frames=9, points=150, parallax=0.3, noise_px=0.2, seed=seed)
         solved = solved_with_lens(
-            problem.truth, problem.observations, PolishOptions(tolerance=1e-6), 0.2, np.zeros(4)
+            problem.truth, problem.observations, PolishOptions(tolerance=1e-6), 0.2, np.zeros(LENS_SIZE)
         )  # fmt: skip
         errors.append(solved.state.log_focal[0] - np.log(problem.focal))
         said.append(np.sqrt(_left_out_covariance(solved)[0, 0] / lens_covariances(solved)[0][0, 0]))
@@ -209,7 +211,7 @@ def test_what_is_left_out_shows_that_parts_of_the_shot_disagree():
         part = image_cells(o.xy, 3, 2) + 6 * (o.frame // 3)
         shift = 0.5 / problem.focal * np.random.default_rng(seed).standard_normal((18, 2))
         solved = solved_with_lens(
-            problem.truth, replace(o, xy=o.xy + shift[part]), PolishOptions(tolerance=1e-6), 0.3, np.zeros(4)
+            problem.truth, replace(o, xy=o.xy + shift[part]), PolishOptions(tolerance=1e-6), 0.3, np.zeros(LENS_SIZE)
         )  # fmt: skip
         error = solved.state.log_focal[0] - np.log(problem.focal)
         off["within"].append(error / np.sqrt(max(c[0, 0] for c in lens_covariances(solved))))
@@ -267,7 +269,7 @@ def test_a_translation_that_is_none_does_not_bend_with_the_lens(motion, parallax
     bent = replace(problem.truth, translation=problem.truth.translation + 0.01 * np.eye(8, 3))
     solved, moves = _solved_as_it_moves(
         replace(bent, translation=bent.translation - bent.translation[0]), seen, PolishOptions(tolerance=1e-5), 0.05,
-        np.array([0.1, 0.1, 0.0, 0.0]), None,
+        np.array([0.1, 0.1, 0.0, 0.0, 0.0, 0.0]), None,
     )  # fmt: skip
     assert moves == (motion == "arc")
     assert solved.state.translation.any() == moves
@@ -286,7 +288,7 @@ def test_tracks_that_fit_no_lens_determine_none():
 @pytest.mark.parametrize("lens", ["distortion", "all"])
 def test_distortion_is_recovered_over_the_image(lens):
     problem = make_problem("arc", frames=8, points=250, parallax=0.3, noise_px=0.03)
-    shape = BARREL if lens == "distortion" else BARREL + [0, 0, 0.01, -0.008]
+    shape = BARREL if lens == "distortion" else BARREL + [0, 0, 0.01, -0.008, 0, 0]
     found = estimated(problem, guess=1.2, shape=shape, lens=lens).lens
     assert found.determined
     assert (found.shape_std[:2] < 0.05).all()
@@ -312,10 +314,10 @@ def test_the_search_sees_through_distortion_where_it_may():
     """Without distortion, the best focal length is one with which the tracks do not fit."""
     problem = make_problem("arc", frames=10, points=200, parallax=0.1, noise_px=0.05)
     seen = replace(problem.observations, xy=distort(problem.observations.xy, STRONG_BARREL)[0])
-    guess = Lens(np.array([problem.focal]), np.zeros(4))
+    guess = Lens(np.array([problem.focal]))
     adjustment = BundleAdjustment(problem.truth, seen, PolishOptions(), sigma=0.2)
     straight, cost = search_lens(adjustment, guess, PolishOptions())
-    bent, bent_cost = search_lens(adjustment, guess, PolishOptions(), np.array([0.1, 0.1, 0.0, 0.0]))
+    bent, bent_cost = search_lens(adjustment, guess, PolishOptions(), np.array([0.1, 0.1, 0.0, 0.0, 0.0, 0.0]))
     assert not straight.shape.any()
     assert bent_cost < 0.5 * cost
     assert bent.focal[0] == pytest.approx(problem.focal, rel=0.1)

@@ -98,7 +98,7 @@ def _method(arguments: argparse.Namespace, *, several: bool) -> Method:
     if not (several and masks and Path(masks).is_dir()):
         open_masks(masks)
     camera = open_camera(arguments.camera)
-    return Method(camera, depth, arguments.depth_kind, masks, arguments.preset, arguments.lens)
+    return Method(camera, depth, arguments.depth_kind, masks, arguments.preset, arguments.lens, arguments.shutter)
 
 
 def _absolute(text: str | None) -> str | None:

@@ -14,7 +14,7 @@ import pycolmap
 from factorsfm.camera import camera_to_json
 from factorsfm.errors import InputError
 from factorsfm.frames import list_files
-from factorsfm.options import LensFreedom
+from factorsfm.options import LensFreedom, ShutterUse
 from factorsfm.priors.masks import MaskFolder
 from factorsfm.shots import find_shots
 from factorsfm.summary import json_text
@@ -35,6 +35,7 @@ class Method:
     masks: str | None = None
     preset: str = "default"
     lens: LensFreedom = "auto"
+    shutter: ShutterUse = "auto"
 
     def of_video(self, name: str) -> Method:
         """With what belongs to this video of several: folders of its name in those of maps and masks."""
@@ -54,6 +55,7 @@ class Method:
             "masks": self.masks,
             "preset": self.preset,
             "lens": self.lens,
+            "shutter": self.shutter,
         }
 
 

@@ -44,6 +44,7 @@ def reconstruct_shot(job: Job, *, one_thread: bool, progress: Progress | None = 
                 frames=slice(job.frames.start, job.frames.stop),
                 preset=method.preset,
                 lens=method.lens,
+                shutter=method.shutter,
                 progress=progress,
             )
     except FactorsfmError as error:

@@ -1,5 +1,6 @@
 """Synthetic shots with exact truth: projected points, and a rendered room with video, depth and poses."""
 
+from factorsfm.synthetic.rolling import read_by_rows
 from factorsfm.synthetic.scene import Motion, SyntheticScene, room_camera, synthetic_scene
 from factorsfm.synthetic.shot import (
     RenderedShot,
@@ -13,6 +14,7 @@ __all__ = [
     "Motion",
     "RenderedShot",
     "SyntheticScene",
+    "read_by_rows",
     "render_shot",
     "render_views",
     "room_camera",

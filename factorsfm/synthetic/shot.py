@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from factorsfm.camera import camera_to_json, with_focal
 from factorsfm.errors import InputError
+from factorsfm.synthetic.rolling import read_by_rows
 from factorsfm.synthetic.room import Room
 from factorsfm.synthetic.scene import Floats, Motion, camera_path, room_camera
 
@@ -47,6 +48,7 @@ def render_shot(
     parallax: float = 0.05,
     seed: int = 0,
     zoom: float = 1.0,
+    readout: float = 0.0,
 ) -> RenderedShot:
     """Render a textured room with boxes between 2 and 7 units in front of the camera.
 
@@ -58,6 +60,7 @@ def render_shot(
             exact; beyond about 0.3 the camera may run into a box.
         seed: of the room, its textures and the handheld sway.
         zoom: focal length of the last frame over that of the first; between them it changes softly.
+        readout: of a rolling shutter, see `read_by_rows`; poses and depths are those of the middle of the image.
 
     Raises:
         InputError: an unknown motion, fewer than 2 frames, a parallax outside 0 to 1, or a zoom that is not positive.
@@ -73,9 +76,13 @@ def render_shot(
     views = [
         (with_focal(camera, camera.focal_length_x * factor), pose) for factor, pose in zip(zooms, path, strict=True)
     ]
+    images = [room.image(lens, pose) for lens, pose in views]
+    depths = [room.depth(lens, pose).astype(np.float32) for lens, pose in views]
+    if readout:
+        images = [read_by_rows(image, depths[k], views[k][0], path, k, readout) for k, image in enumerate(images)]
     return RenderedShot(
-        images=[room.image(lens, pose) for lens, pose in views],
-        depths=[room.depth(lens, pose).astype(np.float32) for lens, pose in views],
+        images=images,
+        depths=depths,
         camera=camera,
         cam_from_world=path,
         zoom=zooms,

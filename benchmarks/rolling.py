@@ -1,0 +1,158 @@
+"""Rolling shutter: shots read row by row with a known readout, and real clips; what is found, and what it is worth.
+
+    python -m benchmarks.rolling --data FOLDER --models FOLDER
+
+FOLDER/studiosim and FOLDER/real hold the shots with their truth (`benchmarks.inputs`). The studio shots are read anew
+by a rolling shutter (`factorsfm.synthetic.read_by_rows`), with their true depth and poses; the real clips are as they
+are.
+Rows that were measured before and are not asked for stay as they are (`results/rolling.json`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, get_args
+
+import cv2
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+import factorsfm
+from benchmarks.inputs import NETWORK_FILES
+from benchmarks.lens import pose_auc
+from factorsfm.evaluation.alignment import pose_arrays
+from factorsfm.evaluation.metrics import trajectory_errors
+from factorsfm.evaluation.readers import read_shot
+from factorsfm.evaluation.truth import Shot
+from factorsfm.options import ShutterUse
+from factorsfm.synthetic import read_by_rows
+
+READOUTS = {"d03": 0.9, "d05": 0.4, "d06": 0.9, "d07": 0.6, "d09": 0.4, "d10": 0.9}
+REAL = ("desk", "hololens", "kitchen", "tsukuba")
+USES = get_args(ShutterUse)
+_RESULTS = Path(__file__).parent / "results"
+RESULT, ROWS = _RESULTS / "ROLLING.md", _RESULTS / "rolling.json"
+
+Row = dict[str, Any]
+
+
+class Rolled:
+    """The frames of a shot as a rolling shutter would have read them."""
+
+    def __init__(self, shot: Shot, readout: float) -> None:
+        frames = list(shot.frames())
+        rotation, center = shot.truth(np.array([frame.index for frame in frames]))
+        path = [pycolmap.Rigid3d(pycolmap.Rotation3d(r), c).inverse() for r, c in zip(rotation, center, strict=True)]
+        self._frames = []
+        for k, frame in enumerate(frames):
+            known = shot.depth(frame.index)
+            known = shot.depth(frame.index - 1) if known is None else known  # every second one has depth
+            assert known is not None
+            image = read_by_rows(frame.image, _filled(known), shot.camera, path, k, readout)
+            self._frames.append(replace(frame, image=image))
+
+    def __iter__(self) -> Iterator[factorsfm.Frame]:
+        return iter(self._frames)
+
+
+def _filled(depth: NDArray[np.float32]) -> NDArray[np.float32]:
+    """With what is unknown as far as the farthest is."""
+    far = float(np.nanmax(np.where(np.isfinite(depth), depth, 0.0)))
+    return np.where(np.isfinite(depth), depth, np.float32(far)).astype(np.float32)
+
+
+def shot_row(shot: Shot, depth: factorsfm.DepthModel, readout: float | None) -> Row:
+    """A shot, read by rows unless it was recorded so, with each use of its shutter, its lens known and unknown."""
+    source = shot.source if readout is None else Rolled(shot, readout)
+    row: Row = {"readout": "" if readout is None else f"{readout:.2f}"}
+
+    def solved(use: ShutterUse, camera: pycolmap.Camera | None) -> factorsfm.Reconstruction:
+        return factorsfm.reconstruct(source, camera=camera, depth=depth, masks=shot.masks, shutter=use)
+
+    known = {use: solved(use, shot.camera) for use in USES}
+    open_lens = {use: solved(use, None) for use in USES if use != "rolling"}
+    row["found"] = _readout(known["auto"])
+    row |= {f"ATE mm, {use}": f"{_ate(known[use], shot):.2f}" for use in USES}
+    row |= {f"AUC, {use}": pose_auc(known[use], shot) for use in USES}
+    row["px, global"], row["px, rolling"] = (
+        f"{np.median(known[use].observation_error):.3f}" for use in ("global", "rolling")
+    )
+    row["found, lens unknown"] = _readout(open_lens["auto"])
+    row |= {f"f error %, {use}": _focal(result, shot) for use, result in open_lens.items()}
+    return row
+
+
+def _readout(result: factorsfm.Reconstruction) -> str:
+    fit = result.shutter
+    return "none" if fit is None else f"{fit.readout:.3f} ± {fit.std:.3f}{'' if fit.along == 'rows' else ' columns'}"
+
+
+def _focal(result: factorsfm.Reconstruction, shot: Shot) -> str:
+    fit, error = result.lens, result.camera.mean_focal_length() / shot.camera.mean_focal_length() - 1
+    assert fit is not None
+    std = f" ± {100 * fit.focal_std:.2f}" if fit.focal_std is not None else ""
+    return f"{100 * error:+.2f}{std}{'' if fit.determined else ' (not determined)'}"
+
+
+def _ate(result: factorsfm.Reconstruction, shot: Shot) -> float:
+    poses = pose_arrays([f.cam_from_world for f in result.registered if f.cam_from_world is not None])
+    errors = trajectory_errors(*poses, *shot.truth(np.array([f.index for f in result.registered])))
+    return 1e3 * float(np.sqrt(np.mean(errors.ate**2)))
+
+
+def main() -> None:
+    """Measure what is asked for and write the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--models", type=Path, required=True)
+    parser.add_argument("--shots", nargs="*", default=[*READOUTS, *REAL], help="beginnings of names")
+    arguments = parser.parse_args()
+    cv2.setNumThreads(1)
+    depth = factorsfm.DepthModel(arguments.models / NETWORK_FILES["tcmonodepth"])
+    rows: dict[str, Row] = json.loads(ROWS.read_text()) if ROWS.exists() else {}
+    for folder in sorted(arguments.data.glob("*/*")):
+        if folder.name.startswith(tuple(arguments.shots)):
+            readout = next((r for name, r in READOUTS.items() if folder.name.startswith(name)), None)
+            rows[folder.name] = shot_row(read_shot(folder), depth, readout)
+            print(folder.name, rows[folder.name], flush=True)
+            ROWS.write_text(json.dumps(rows, indent=1) + "\n")
+            RESULT.write_text(report(rows))
+
+
+def report(rows: dict[str, Row]) -> str:
+    """The tables, as Markdown."""
+    rows = dict(sorted(rows.items()))
+    made = {name: row for name, row in rows.items() if row["readout"]}
+    real = {name: {k: v for k, v in row.items() if k != "readout"} for name, row in rows.items() if not row["readout"]}
+    return "\n".join(
+        [
+            "# Rolling shutter", "",
+            "`python -m benchmarks.rolling --data FOLDER --models FOLDER`", "",
+            "Each shot with `shutter` global (it is not looked for), auto (poses fit the recorded images) and rolling "
+            "(poses of the moment at which the middle of the image is read). Readout: share of the time between two "
+            "frames from the first row to the last. ATE: root mean square after alignment; AUC: relative poses at 1 / "
+            "5 degrees; px: median reprojection error. Then the same without a camera: error of the focal length, and "
+            "its standard deviation.", "",
+            "Studio shots, read anew row by row with a known readout; the truth is of the middle of the image:", "",
+            *_table(made),
+            "Real clips. The reference of the kitchens stems from a reconstruction that knows of no rolling shutter, "
+            "and errs as the recorded images do; that of the HoloLens is its head tracking. tsukuba is rendered, "
+            "without.", "",
+            *_table(real),
+        ]
+    )  # fmt: skip
+
+
+def _table(rows: dict[str, Row]) -> list[str]:
+    columns = list(next(iter(rows.values()), {}))
+    lines = [f"| {name} | {' | '.join(row[c] for c in columns)} |" for name, row in rows.items()]
+    return [f"| shot | {' | '.join(columns)} |", "|---" * (len(columns) + 1) + "|", *lines, ""]
+
+
+if __name__ == "__main__":
+    main()
