@@ -18,7 +18,7 @@ from factorsfm.images import MappedImage, gather, seen_by
 from factorsfm.joined import joined_frames
 from factorsfm.lens import Lens, LensEstimate
 from factorsfm.marginals import in_scene_unit
-from factorsfm.noise import SMALLEST_SIGMA_PX
+from factorsfm.noise import SMALLEST_SIGMA_PX, coordinate_sigma
 from factorsfm.observability import Motion, camera_observability, pose_blocks
 from factorsfm.options import Options, PolishOptions
 from factorsfm.polish_start import polish_start
@@ -234,11 +234,11 @@ def _fit_to_recorded_images(result: Polished, shutter: Shutter, options: PolishO
     """What agrees with the rolling shutter, seen by cameras without one."""
     recorded = shutter.recorded(result.observations, result.state)
     weight = cauchy(result.errors[:, None] / result.sigma, options.kernel)[1]
-    result.state = replace(seen_at_once(result.state, recorded, weight), world=-1).seen_from(0)
+    moves = result.motion.kind is ShotKind.GENERAL
+    result.state = replace(seen_at_once(result.state, recorded, weight, moves=moves), world=-1).seen_from(0)
     result.observations, result.recorded = recorded, True
-    result.errors = BundleAdjustment(
-        result.state, recorded, options, sigma=result.sigma
-    ).reprojection_errors()  # fmt: skip
+    result.errors = BundleAdjustment(result.state, recorded, options, sigma=result.sigma).reprojection_errors()
+    result.sigma = coordinate_sigma(result.errors)
 
 
 def _gather(images: list[MappedImage], min_length: int) -> tuple[Observations, Index]:
