@@ -32,7 +32,7 @@ from factorsfm.evaluation.truth import Shot
 from factorsfm.options import ShutterUse
 from factorsfm.synthetic import read_by_rows
 
-READOUTS = {"d03": 0.9, "d05": 0.4, "d06": 0.9, "d07": 0.6, "d09": 0.4, "d10": 0.9}
+READOUTS = {"d03": 0.9, "d05": 0.4, "d07": 0.6, "d10": 0.9}
 REAL = ("desk", "hololens", "kitchen", "tsukuba")
 USES = get_args(ShutterUse)
 _RESULTS = Path(__file__).parent / "results"

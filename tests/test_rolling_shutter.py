@@ -76,11 +76,23 @@ def wrong_by(found, problem):
     return float(np.sqrt(np.mean(angles**2))), float(np.sqrt(np.mean(away**2)))
 
 
-@pytest.mark.parametrize("along", ["rows", "columns"])
-@pytest.mark.parametrize("readout", [0.3, 0.9, -0.6])
+@cache
+def handheld():
+    return rolling_problem("handheld", 0.9)
+
+
+@cache
+def handheld_polished(shutter):
+    return polished(handheld(), shutter=shutter)
+
+
+@pytest.mark.parametrize(("readout", "along"), [(0.9, "rows"), (0.3, "columns"), (-0.6, "rows")])
 def test_the_readout_is_found_and_poses_are_those_of_the_middle(readout, along):
-    problem = rolling_problem("handheld", readout, along=along)
-    found, ignored = polished(problem), polished(problem, shutter="global")
+    if (readout, along) == (0.9, "rows"):
+        problem, found, ignored = handheld(), handheld_polished("rolling"), handheld_polished("global")
+    else:
+        problem = rolling_problem("handheld", readout, along=along)
+        found, ignored = polished(problem), polished(problem, shutter="global")
     index = {"columns": 0, "rows": 1}[along]
     assert found.shutter is not None
     assert found.shutter.readout[index] == pytest.approx(readout, abs=max(0.01, 3 * found.shutter.std))
@@ -126,8 +138,7 @@ def test_an_unknown_focal_length_is_found_beside_the_readout():
 
 
 def test_poses_of_the_recorded_images_show_the_points_where_the_images_do():
-    problem = rolling_problem("handheld", 0.9)
-    rolling, recorded = polished(problem), polished(problem, shutter="auto")
+    problem, rolling, recorded = handheld(), handheld_polished("rolling"), handheld_polished("auto")
     assert recorded.recorded
     assert not rolling.recorded
     np.testing.assert_allclose(recorded.state.rotation[0], np.eye(3), atol=1e-12)
@@ -161,13 +172,13 @@ def test_cameras_of_the_recorded_images_are_exact_where_the_shutter_is_not_rolli
 
 
 def test_frames_between_are_of_the_same_moment_as_the_others():
-    problem = rolling_problem("handheld", 0.9)
+    problem = handheld()
     few = polished(problem, max_frames=20)
     assert few.frames == list(range(48))
     assert few.shutter.readout[1] == pytest.approx(0.9, abs=0.03)
     assert wrong_by(few, problem)[0] < 0.03
     recorded = polished(problem, max_frames=20, shutter="auto")
-    exact = polished(problem, shutter="auto")
+    exact = handheld_polished("auto")
     assert np.degrees(angles_between(recorded.state.rotation, exact.state.rotation)).max() < 0.05
 
 
@@ -216,8 +227,7 @@ def test_a_camera_that_turns_does_not_seem_to_move(lens):
     ("readout", "order"), [([0.0, 0.9], "top to bottom"), ([0.0, -0.9], "bottom to top"), ([0.4, 0.0], "left to right")]
 )
 def test_the_note_says_how_images_are_read(readout, order):
-    problem = rolling_problem("handheld", 0.9, frames=12)
-    found = polished(problem).shutter
+    found = handheld_polished("rolling").shutter
     shutter = replace(found, lens=Lens(found.lens.focal, np.r_[np.zeros(4), readout]), std=0.021)
 
     class Frame:
