@@ -82,6 +82,8 @@ def shot_row(shot: Shot, depth: factorsfm.DepthModel, readout: float | None) -> 
     row["px, global"], row["px, rolling"] = (
         f"{np.median(known[use].observation_error):.3f}" for use in ("global", "rolling")
     )
+    if readout is None:
+        row |= {f"depth spread %, {use}": _depth_spread(known[use], shot) for use in ("global", "rolling")}
     row["found, lens unknown"] = _readout(open_lens["auto"])
     row |= {f"f error %, {use}": _focal(result, shot) for use, result in open_lens.items()}
     return row
@@ -103,6 +105,25 @@ def _ate(result: factorsfm.Reconstruction, shot: Shot) -> float:
     poses = pose_arrays([f.cam_from_world for f in result.registered if f.cam_from_world is not None])
     errors = trajectory_errors(*poses, *shot.truth(np.array([f.index for f in result.registered])))
     return 1e3 * float(np.sqrt(np.mean(errors.ate**2)))
+
+
+def _depth_spread(result: factorsfm.Reconstruction, shot: Shot) -> str:
+    """Robust deviation of the points' depths from the sensor's, relative, but for one scale."""
+    ratios = []
+    for position, frame in enumerate(result.frames):
+        depth = shot.depth(frame.index)
+        if frame.cam_from_world is None or depth is None:
+            continue
+        mine = result.observation_frame == position
+        z = (frame.cam_from_world * result.points[result.observation_point[mine]])[:, 2]
+        x, y = np.round(result.observation_xy[mine]).astype(int).T
+        sensor = depth[np.clip(y, 0, depth.shape[0] - 1), np.clip(x, 0, depth.shape[1] - 1)]
+        seen = np.isfinite(sensor) & (z > 0)
+        ratios.append(np.log(z[seen] / sensor[seen]))
+    if not ratios:
+        return "–"
+    ratio = np.concatenate(ratios)
+    return f"{148.26 * np.median(np.abs(ratio - np.median(ratio))):.1f}"
 
 
 def main() -> None:
@@ -136,7 +157,8 @@ def report(rows: dict[str, Row]) -> str:
             "Each shot with `shutter` global (it is not looked for), auto (poses fit the recorded images) and rolling "
             "(poses of the moment at which the middle of the image is read). Readout: share of the time between two "
             "frames from the first row to the last. ATE: root mean square after alignment; AUC: relative poses at 1 / "
-            "5 degrees; px: median reprojection error. Then the same without a camera: error of the focal length, and "
+            "5 degrees; px: median reprojection error; depth spread: robust deviation of the points' depths from a "
+            "depth sensor's, but for one scale. Then the same without a camera: error of the focal length, and "
             "its standard deviation.", "",
             "Studio shots, read anew row by row with a known readout; the truth is of the middle of the image:", "",
             *_table(made),
