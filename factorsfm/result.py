@@ -294,7 +294,9 @@ def _shutter_note(shutter: RollingShutter, frames: Sequence[SeenFrame]) -> str:
     times = [frame.timestamp for frame in frames if frame.timestamp is not None]
     interval = float(np.median(np.diff(times))) if len(times) == len(frames) else 0.0
     milliseconds = f" ({1e3 * abs(shutter.readout) * interval:.1f} ms)" if interval > 0 else ""
-    poses = "fit the recorded images" if shutter.recorded else "are those of the image's middle"
+    poses = "are those of the image's middle"
+    if shutter.recorded:
+        poses = "fit the recorded images, with --shutter rolling they are those of the image's middle"
     return (
         f"Rolling shutter: images are read from {first} to {last} in {abs(shutter.readout):.2f} ± "
         f"{shutter.std:.2f} of the time between two frames{milliseconds}. Lens and points are free of it; "
