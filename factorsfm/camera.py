@@ -17,6 +17,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from factorsfm.errors import InputError
+from factorsfm.options import GUESSED_FOCAL_STD, TOLD_FOCAL_STD
 
 logger = logging.getLogger(__name__)
 
@@ -149,6 +150,11 @@ def with_focal(camera: pycolmap.Camera, focal: float) -> pycolmap.Camera:
         params[index] *= ratio
         estimated.params = params
     return estimated
+
+
+def first_focal_std(camera: pycolmap.Camera, *, given: bool) -> float:
+    """How well a focal length is known before its images are seen, relative; `given`: by a camera file."""
+    return TOLD_FOCAL_STD if given or camera.has_prior_focal_length else GUESSED_FOCAL_STD
 
 
 def lens_shape(camera: pycolmap.Camera) -> NDArray[np.float64]:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from factorsfm.camera import (
     PIXEL_CENTER,
+    first_focal_std,
     guess_camera,
     lens_shape,
     normalized_from_pixels,
@@ -263,6 +264,7 @@ class ImageSet:
                     lambda stage: progress(stage, 0, None),
                     lens_shape(camera) if options.estimates_lens else None,
                     control=control and _scaled(control, camera.mean_focal_length() / part.focal),
+                    first_focal=(np.array([part.first_focal]), first_focal_std(camera, given=self._lens_given)),
                 )
             except ReconstructionError as error:
                 raise self._failure(str(error), part.images) from error

@@ -79,14 +79,14 @@ class SetMapper:
 
     Attributes:
         images: what became of each image; points: the map.
-        focal: as the tracks of `images` are normalised with it.
+        focal: as the tracks of `images` are normalised with it; first_focal: what was thought of it at first.
     """
 
     def __init__(self, tracks: list[ImageTracks], focal: float, options: Options) -> None:
         self.focal = focal
         self.options = options.mapper
         self._refine_focal = options.refine_focal_length
-        self._guess = focal
+        self.first_focal = focal
         self._adjustment = replace(options.polish, iterations=10, tolerance=1e-3)
         self.images = [MappedImage(t, FrameStatus.WAITING, "waiting for the start of the map") for t in tracks]
         self.points = PointMap()
@@ -309,7 +309,7 @@ class SetMapper:
         )
         state = adjustment.solve()
         focal = float(np.exp(state.log_focal[0]))
-        if free_focal and 0.3 < focal / self._guess < 3.0:
+        if free_focal and 0.3 < focal / self.first_focal < 3.0:
             self._set_focal(focal)
         errors = adjustment.reprojection_errors()
         logger.debug(

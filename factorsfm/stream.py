@@ -21,6 +21,7 @@ from factorsfm.camera import (
     camera_from_json,
     camera_to_json,
     check_camera,
+    first_focal_std,
     guess_camera,
     lens_shape,
     normalized_from_pixels,
@@ -34,7 +35,7 @@ from factorsfm.frames import Frame, as_frame
 from factorsfm.graph_process import GraphProcess
 from factorsfm.images import ImageTracks, MappedImage
 from factorsfm.mapper import Mapper
-from factorsfm.options import GUESSED_FOCAL_STD, TOLD_FOCAL_STD, Options
+from factorsfm.options import Options
 from factorsfm.polish import polish
 from factorsfm.priors.depth import DepthKind, DepthPrior
 from factorsfm.priors.masks import MaskPrior
@@ -283,7 +284,7 @@ class Stream(Closing):
                 lambda stage: progress(stage, 0, None) if progress else None,
                 lens_shape(self.camera) if self.options.estimates_lens else None,
                 control=control,
-                first_focal=(np.array([mapper.first_focal]), self._first_focal_std),
+                first_focal=(np.array([mapper.first_focal]), first_focal_std(self.camera, given=self._lens_given)),
                 recording=self._recording(),
             )
         reconstruction = assemble(
@@ -306,12 +307,6 @@ class Stream(Closing):
             reconstruction.notes.append(f"The map went on without the depth prior: {mapper.without_prior}.")
         self._thumbnails.attach(reconstruction.frames)
         return reconstruction
-
-    @property
-    def _first_focal_std(self) -> float:
-        """How well the focal length was known at first."""
-        assert self.camera is not None
-        return TOLD_FOCAL_STD if self._lens_given or self.camera.has_prior_focal_length else GUESSED_FOCAL_STD
 
     def _recording(self) -> Recording | None:
         """What a rolling shutter is looked for in."""

@@ -71,7 +71,7 @@ def wrong_by(found, problem):
     truth, state = problem.truth, found.state
     truth_centers, centers = (-np.einsum("kji,kj->ki", s.rotation, s.translation) for s in (truth, state))
     scale = (truth_centers * centers).sum() / max((centers**2).sum(), 1e-30)
-    away = np.linalg.norm(scale * centers - truth_centers, axis=1) / np.ptp(truth_centers, axis=0).max()
+    away = np.linalg.norm(scale * centers - truth_centers, axis=1) / max(np.ptp(truth_centers, axis=0).max(), 1e-12)
     angles = np.degrees(angles_between(state.rotation, truth.rotation))
     return float(np.sqrt(np.mean(angles**2))), float(np.sqrt(np.mean(away**2)))
 
