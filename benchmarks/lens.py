@@ -254,21 +254,22 @@ def report(rows: dict[str, Row]) -> str:
             "focal length. Not determined: not certain enough to count as an estimate; without a std the first guess "
             "is kept. f of true poses: with which the tracks fit the true poses; where it is another one, poses and "
             "camera of the reference do not belong together.", "",
-            *_table("shot", plain),
+            *rows_table("shot", plain),
             "Parts of the same shots (`--parts NAME ...`):", "",
-            *_table("shot, part", parts),
+            *rows_table("shot, part", parts),
             "The same seen through lenses with distortion k1, k2, and unknown; the focal length is a little longer, so "
             "that the image is full. px: between the pixels of the same ray in the true and in the found lens, over "
             "the image; at its own focal length: the median of what is left when the error of the focal length is "
             "taken out.", "",
-            *_table("shot, k1, k2", bent),
+            *rows_table("shot, k1, k2", bent),
             "The same with the focal length given (`--lens radial`):", "",
-            *_table("shot, k1, k2", held),
+            *rows_table("shot, k1, k2", held),
         ]
     )  # fmt: skip
 
 
-def _table(first: str, rows: dict[str, Row]) -> list[str]:
+def rows_table(first: str, rows: dict[str, Row]) -> list[str]:
+    """The rows as a table; `first`: heading of the column with their names."""
     columns = list(next(iter(rows.values()), {}))
     lines = [f"| {key} | {' | '.join(row[c] for c in columns)} |" for key, row in rows.items()]
     return [f"| {first} | {' | '.join(columns)} |", "|---" * (len(columns) + 1) + "|", *lines, ""]

@@ -15,7 +15,7 @@ import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 import cv2
 import numpy as np
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 import factorsfm
 from benchmarks.inputs import NETWORK_FILES
-from benchmarks.lens import pose_auc
+from benchmarks.lens import Row, pose_auc, rows_table
 from factorsfm.evaluation.alignment import pose_arrays
 from factorsfm.evaluation.metrics import trajectory_errors
 from factorsfm.evaluation.readers import read_shot
@@ -37,8 +37,6 @@ REAL = ("desk", "hololens", "kitchen", "tsukuba")
 USES = get_args(ShutterUse)
 _RESULTS = Path(__file__).parent / "results"
 RESULT, ROWS = _RESULTS / "ROLLING.md", _RESULTS / "rolling.json"
-
-Row = dict[str, Any]
 
 
 class Rolled:
@@ -161,19 +159,13 @@ def report(rows: dict[str, Row]) -> str:
             "depth sensor's, but for one scale. Then the same without a camera: error of the focal length, and "
             "its standard deviation.", "",
             "Studio shots, read anew row by row with a known readout; the truth is of the middle of the image:", "",
-            *_table(made),
+            *rows_table("shot", made),
             "Real clips. The reference of the kitchens stems from a reconstruction that knows of no rolling shutter, "
             "and errs as the recorded images do; that of the HoloLens is its head tracking. tsukuba is rendered, "
             "without.", "",
-            *_table(real),
+            *rows_table("shot", real),
         ]
     )  # fmt: skip
-
-
-def _table(rows: dict[str, Row]) -> list[str]:
-    columns = list(next(iter(rows.values()), {}))
-    lines = [f"| {name} | {' | '.join(row[c] for c in columns)} |" for name, row in rows.items()]
-    return [f"| shot | {' | '.join(columns)} |", "|---" * (len(columns) + 1) + "|", *lines, ""]
 
 
 if __name__ == "__main__":

@@ -40,6 +40,15 @@ def cross_matrices(vectors: Array) -> Array:
     return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
 
 
+def exponential(rotation_vector: Array) -> Array:
+    """(n, 3, 3) rotation matrices of (n, 3) rotation vectors."""
+    angle = np.linalg.norm(rotation_vector, axis=1)[:, None, None]
+    hat = cross_matrices(rotation_vector)
+    safe = np.maximum(angle, 1e-8)
+    half = np.sinc(angle / 2.0 / np.pi) ** 2 / 2.0
+    return np.asarray(np.eye(3) + np.sin(safe) / safe * hat + half * (hat @ hat))
+
+
 def by_pose(by_q: Array, q: Array, w: Array) -> Array:
     """Chain a derivative by `q` to the pose perturbation (omega, v).
 

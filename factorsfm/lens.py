@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 
 from factorsfm.factors import distort
 from factorsfm.options import LensFreedom
-from factorsfm.problem import LENS_SIZE, Observations, State
+from factorsfm.problem import DISTORTION, LENS_SIZE, READOUT, Observations, State
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-DISTORTION, READOUT = slice(0, 4), slice(4, 6)  # of `State.lens`: distortion with principal point, readout
 READOUT_SIGMA = 1.0  # frames, of a rolling shutter of which nothing is known
 _DISTORTION_SIGMA = 0.1
 _CENTER_SIGMA = 0.02  # of the width

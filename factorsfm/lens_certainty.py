@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.lens import DISTORTION
 from factorsfm.noise import block_inflation, image_cells
-from factorsfm.problem import LENS_SIZE
+from factorsfm.problem import DISTORTION, LENS_SIZE
 from factorsfm.refinement import BundleAdjustment
 
 Array = NDArray[np.float64]
@@ -43,7 +42,7 @@ def lens_covariances(adjustment: BundleAdjustment) -> list[Array]:
     there are is seen in blocks of residuals, and in how differently the parts of the image, and the tracks, pull.
     """
     columns = 6 * len(adjustment.state.rotation) + adjustment.free_lens
-    whole, _ = adjustment.covariance(np.zeros(0, np.int64))
+    whole = adjustment.marginals().camera
     inflation = block_inflation(adjustment.reprojection_vectors(), adjustment.observations)
     o, influence = adjustment.observations, adjustment.influences(columns)
     xy = np.stack([np.bincount(o.point, o.xy[:, i]) for i in range(2)], -1) / np.bincount(o.point)[:, None]

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.factors import distort
-from factorsfm.lens import DISTORTION, READOUT, READOUT_SIGMA, Lens, LensEstimate, renormalized, shape_sigmas, through
+from factorsfm.lens import READOUT_SIGMA, Lens, LensEstimate, renormalized, shape_sigmas, through
 from factorsfm.lens_certainty import lens_deviations
 from factorsfm.lens_search import search_lens
 from factorsfm.noise import coordinate_sigma
 from factorsfm.observability import LEAST_GAIN, classify_motion, translation_gain
 from factorsfm.options import FOCAL_STD, TOLD_FOCAL_STD, Options, PolishOptions
-from factorsfm.problem import LENS_SIZE, Observations, State
+from factorsfm.problem import DISTORTION, LENS_SIZE, READOUT, Observations, State
 from factorsfm.reconstruction import ShotKind
 from factorsfm.refinement import BundleAdjustment
 

@@ -213,8 +213,7 @@ def _better_focal(adjustment: BundleAdjustment, held: NDArray[np.bool_]) -> floa
         sigma=adjustment.sigma, free_focal=True, fixed=held, prior=adjustment.prior,
     )  # fmt: skip
     state = free.solve(_LENS_ITERATIONS)
-    covariance, _ = free.covariance(np.zeros(0, np.int64))
-    variance = _ALIKE * covariance[6 * len(held), 6 * len(held)]
+    variance = _ALIKE * free.marginals().camera[6 * len(held), 6 * len(held)]
     if variance > _LENS_STD**2 or abs(state.log_focal - adjustment.state.log_focal)[0] > _LARGEST_LENS_STEP:
         return None
     adjustment.state = state

@@ -19,7 +19,7 @@ class Marginals:
     """Uncertainty of a `BundleAdjustment` whose only held pose is the first.
 
     Attributes:
-        camera: (c, c) covariance of the camera side, columns as in `BundleAdjustment.covariance`.
+        camera: (c, c) covariance of the camera side, columns as in `BundleAdjustment.marginals`.
         point: (n, 3, 3) covariance of each point given the camera side: two tangent directions of the bearing (see
             `tangent_basis`), inverse distance.
         blocks: camera-point blocks of the information matrix with their columns, by span of points.
@@ -44,6 +44,18 @@ class Marginals:
         spread = moved @ pull.T + np.einsum("nig,nih->gh", measured, weighted)
         mixed = motion @ moved
         return np.asarray(self.camera - mixed - mixed.T + motion @ spread @ motion.T)
+
+    def inverse_distances(self, points: Index) -> Array:
+        """(p, p) joint covariance of the inverse distances of some points."""
+        gain = np.zeros((len(points), len(self.camera)))
+        for cross, columns, span in self.blocks:
+            inside = np.nonzero((points >= span.start) & (points < span.stop))[0]
+            local = points[inside] - span.start
+            picked = cross.reshape(len(columns), -1, 3)[:, local]
+            gain[np.ix_(inside, columns)] = np.einsum("cpi,pi->pc", picked, self.point[points[inside], 2])
+        joint = gain @ self.camera @ gain.T
+        joint[np.diag_indices_from(joint)] += self.point[points, 2, 2]
+        return np.asarray(joint)
 
     def inverse_distance_std(self, camera: Array) -> Array:
         """(n,) standard deviations of the inverse distances.

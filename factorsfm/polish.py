@@ -119,11 +119,11 @@ def polish(
             frames = sorted({*frames, *frames_under_control(registered, control, o.max_frames // 2)})
         used = [images[i] for i in frames]
         observations, tracks = _gather(used, min(o.min_track_length, max(2, len(used))))
-        if recording is not None:
-            observations = with_sweep(observations, tracks, images, frames, guess, groups[frames], recording)
         unheld = _unheld(observations, frames, least)
         if not unheld:
             group = groups[frames]
+            if recording is not None:
+                observations = with_sweep(observations, tracks, images, frames, guess, group, recording)
             known = polish_start(
                 used, observations, tracks, map_points, guess, group, frames, options, first_focal, progress
             )
@@ -284,7 +284,7 @@ def _add_frames_between(
     state, m = result.state, options.mapper
     seen = gather([images[f] for f in registered], result.tracks)
     if (change := result.lens or result.shutter) is not None:
-        if recording is not None:
+        if result.shutter is not None and recording is not None:
             seen = with_sweep(seen, result.tracks, images, registered, change.guess, group, recording)
         seen = change.renormalize(seen, group)
     by_frame = {f: np.nonzero(seen.frame == k)[0] for k, f in enumerate(registered)}

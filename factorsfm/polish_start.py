@@ -78,8 +78,11 @@ def polish_start(
     start = _first_guess(images, few, tracks[core], map_points, guess.focal, group, _world(observations))
     kept, adjustment = converge_cameras(start, few, options)
     core, few, lens, seen = core[kept], adjustment.observations, None, guess
-    motion, shutter = classify_motion(adjustment, few, o), None
-    if few.sweep is not None and (shutter := find_shutter(adjustment, motion, guess, options)) is not None:
+    motion, shutter = None, None
+    if few.sweep is not None:
+        motion = classify_motion(adjustment, few, o)
+        shutter = find_shutter(adjustment, motion, guess, options)
+    if shutter is not None:
         seen = shutter.lens
         adjustment = converge(adjustment.state, shutter.renormalize(few, group), options)
     if options.estimates_lens:
@@ -88,6 +91,7 @@ def polish_start(
         shutter = shutter and shutter.known_with(lens)
     if (change := lens or shutter) is not None:
         few, observations = adjustment.observations, change.renormalize(observations, adjustment.state.group)
+    if motion is None or change is not None:
         motion = classify_motion(adjustment, few, o)
     inflation = block_inflation(adjustment.reprojection_vectors(), few)
     prior, part = None, motion.rotation_only

@@ -81,7 +81,7 @@ def weigh_prior(
     said = np.bincount(index, (values.inverse_depth - shift[values.image]) / scale[values.image]) / count
     mean_predicted = np.bincount(index, predicted) / count
     sample = sample_points(len(seen))
-    _, covariance = adjustment.covariance(seen[sample])
+    covariance = adjustment.marginals().inverse_distances(seen[sample])
     angles = direction_angles(state.bearing[seen[sample]])
     weight = measure_weight(angles, mean_predicted[sample], said[sample], covariance * inflation)
     logger.info(

@@ -12,7 +12,8 @@ from factorsfm.factors import camera_points
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-LENS_SIZE = 6  # of `State.lens`
+LENS_SIZE = 6  # of `State.lens`, and its parts: distortion with principal point, readout
+DISTORTION, READOUT = slice(0, 4), slice(4, 6)
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from factorsfm.control_term import ControlTerm
 from factorsfm.elimination import Block, Elimination, Normal, Term, conditioned, reduced
-from factorsfm.factors import affine_inverse_depth, by_pose, cauchy, cross_matrices, distort, reprojection
+from factorsfm.factors import affine_inverse_depth, by_pose, cauchy, distort, exponential, reprojection
 from factorsfm.marginals import Marginals, tangent_basis
 from factorsfm.options import PolishOptions
-from factorsfm.problem import LENS_SIZE, Observations, PriorObservations, State
+from factorsfm.problem import LENS_SIZE, READOUT, Observations, PriorObservations, State
 from factorsfm.track_errors import TrackErrors
 
 Array = NDArray[np.float64]
@@ -95,7 +95,7 @@ class BundleAdjustment:
         seen = observations.xy if lens_sigmas is None else distort(observations.xy, state.lens)[0]
         self._pixels = seen * self._focal(state)[:, None]  # what was measured, whatever the lens
         if lens_sigmas is not None:
-            self._pixels += observations.swept(state.lens[4:])
+            self._pixels += observations.swept(state.lens[READOUT])
         frames, images, nodes = len(state.rotation), len(state.scale), len(state.field)
         self._lens = 6 * frames
         self._shape = self._lens + len(state.log_focal)
@@ -154,14 +154,14 @@ class BundleAdjustment:
         residual, by_q = reprojection(q, self._pixels, focal)
         if self._lens_sigmas is not None:
             uv, by_uv, _ = distort(q[:, :2] / q[:, 2:], state.lens)
-            residual = focal[:, None] * uv - self._pixels + o.swept(state.lens[4:])
+            residual = focal[:, None] * uv - self._pixels + o.swept(state.lens[READOUT])
             by_q = by_uv @ by_q
         by_q[behind] = 0.0
         return residual / self.sigma, by_q / self.sigma, q
 
     def _by_lens(self, residual: Array, q: Array) -> Array:
         """(m, 2, c) derivative of the residuals by the columns of the lens: focal length of the frame, shape."""
-        measured = self._pixels - self.observations.swept(self.state.lens[4:])
+        measured = self._pixels - self.observations.swept(self.state.lens[READOUT])
         by_focal = (residual + measured / self.sigma)[:, :, None]  # d r / d log f is the prediction
         if self._lens_sigmas is None:
             return np.asarray(by_focal)
@@ -170,7 +170,7 @@ class BundleAdjustment:
         sweep = self.observations.sweep
         by_readout = np.zeros((len(q), 2, 2))
         if sweep is not None:
-            by_readout = sweep.by_readout(self.state.lens[4:]) / self.sigma
+            by_readout = sweep.by_readout(self.state.lens[READOUT]) / self.sigma
         return np.concatenate([by_focal, by_lens, by_readout], 2)
 
     def _lens_prior(self, state: State) -> tuple[Array, Array]:
@@ -398,27 +398,12 @@ class BundleAdjustment:
 
     # --- uncertainty --------------------------------------------------------------------------------------------
 
-    def covariance(self, points: Index) -> tuple[Array, Array]:
-        """Joint covariance of the camera side, and of the inverse distances of some points.
-
-        Returns:
-            (c, c) over the columns (six per frame in GTSAM's pose convention, log focal lengths, scale and shift per
-            image, field, control), zero where a column is fixed; (p, p) of the inverse distances of `points`.
-        """
-        marginals = self.marginals()
-        camera, given_camera = marginals.camera, marginals.point
-        gain = np.zeros((len(points), self._columns))
-        for cross, columns, span in marginals.blocks:
-            inside = np.nonzero((points >= span.start) & (points < span.stop))[0]
-            local = points[inside] - span.start
-            picked = cross.reshape(len(columns), -1, 3)[:, local]
-            gain[np.ix_(inside, columns)] = np.einsum("cpi,pi->pc", picked, given_camera[points[inside], 2])
-        joint = gain @ camera @ gain.T
-        joint[np.diag_indices_from(joint)] += given_camera[points, 2, 2]
-        return camera, joint
-
     def marginals(self) -> Marginals:
-        """Everything that covariances are made of, at the present state."""
+        """Everything that covariances are made of, at the present state.
+
+        Columns: six per frame in GTSAM's pose convention, log focal lengths, lens, scale and shift per image, field,
+        control; zero where they are fixed.
+        """
         normal = self._linearize()
         blocks = self._elimination.cross_blocks(normal)
         information, _, given_camera = reduced(normal, blocks, 0.0)
@@ -447,12 +432,3 @@ class BundleAdjustment:
             pull = cross.reshape(len(used), -1, 3)
             moved[span] -= np.einsum("cni,ni,cp->np", pull, step[span], gain[used], optimize=True)
         return -moved
-
-
-def exponential(rotation_vector: Array) -> Array:
-    """(n, 3, 3) rotation matrices of (n, 3) rotation vectors."""
-    angle = np.linalg.norm(rotation_vector, axis=1)[:, None, None]
-    hat = cross_matrices(rotation_vector)
-    safe = np.maximum(angle, 1e-8)
-    half = np.sinc(angle / 2.0 / np.pi) ** 2 / 2.0
-    return np.asarray(np.eye(3) + np.sin(safe) / safe * hat + half * (hat @ hat))

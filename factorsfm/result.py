@@ -13,10 +13,10 @@ from factorsfm.camera import with_focal, with_lens
 from factorsfm.controlled import control_notes
 from factorsfm.evaluation.alignment import Similarity
 from factorsfm.images import MappedImage
-from factorsfm.lens import DISTORTION, LensEstimate
+from factorsfm.lens import LensEstimate
 from factorsfm.observability import observability_notes
 from factorsfm.polish import Polished
-from factorsfm.problem import State
+from factorsfm.problem import DISTORTION, State
 from factorsfm.reconstruction import (
     FrameResult,
     FrameStatus,

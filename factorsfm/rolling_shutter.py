@@ -18,15 +18,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.factors import by_pose, distort, reprojection
+from factorsfm.factors import by_pose, cauchy, distort, exponential, reprojection
 from factorsfm.images import MappedImage
-from factorsfm.lens import DISTORTION, READOUT, READOUT_SIGMA, Lens, LensEstimate, renormalized, shape_sigmas
+from factorsfm.lens import READOUT_SIGMA, Lens, LensEstimate, renormalized, shape_sigmas
 from factorsfm.lens_certainty import lens_deviations
 from factorsfm.observability import LEAST_GAIN, Motion, translation_gain
 from factorsfm.options import Options
-from factorsfm.problem import Observations, State, Sweep
+from factorsfm.problem import DISTORTION, READOUT, Observations, State, Sweep
 from factorsfm.reconstruction import ShotKind
-from factorsfm.refinement import BundleAdjustment, exponential
+from factorsfm.refinement import BundleAdjustment
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -137,12 +137,12 @@ def _smooth(values: Array, place: Array) -> Array:
     if known.sum() < _FEWEST:
         return np.zeros_like(values)
     design = np.column_stack([np.ones(len(place)), place])
-    weight = np.ones((int(known.sum()), 1))
+    weight = np.ones(int(known.sum()))
     for _ in range(_ROUNDS):
-        root = np.sqrt(weight)
+        root = np.sqrt(weight)[:, None]
         field, *_ = np.linalg.lstsq(root * design[known], root * values[known], rcond=None)
-        off = np.linalg.norm(values[known] - design[known] @ field, axis=1, keepdims=True)
-        weight = 1.0 / (1.0 + (off / max(float(np.median(off)), 1e-9)) ** 2)
+        off = values[known] - design[known] @ field
+        weight = cauchy(off, max(float(np.median(np.linalg.norm(off, axis=1))), 1e-9))[1]
     return np.asarray(design @ field)
 
 

@@ -181,7 +181,8 @@ def test_the_step_solves_the_whole_system():
     np.testing.assert_allclose(np.append(camera[6:], point), expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max())
     inverse = np.linalg.inv(full[np.ix_(free, free)])
     chosen = np.array([0, 7, n - 1])
-    camera_covariance, covariance = adjustment.covariance(chosen)
+    marginals = adjustment.marginals()
+    camera_covariance, covariance = marginals.camera, marginals.inverse_distances(chosen)
     np.testing.assert_allclose(
         camera_covariance[6:, 6:], inverse[: c - 6, : c - 6], rtol=1e-4, atol=1e-8 * inverse[: c - 6, : c - 6].max()
     )
@@ -383,7 +384,8 @@ def test_the_covariance_is_calibrated():
         adjustment = BundleAdjustment(start, problem.observations, options, sigma=0.3, prior=prior)
         state = adjustment.solve()
         some = np.arange(0, n, 5)
-        camera, points = adjustment.covariance(some)
+        marginals = adjustment.marginals()
+        camera, points = marginals.camera, marginals.inverse_distances(some)
         affine = columns + 1
         field = affine + 2 * len(state.scale)
         errors["poses"].append(normalised(pose_errors(state, truth), camera[6:columns, 6:columns]))
@@ -412,7 +414,8 @@ def test_the_covariance_is_calibrated_up_to_the_unit(motion):
         adjustment = BundleAdjustment(start, problem.observations, PolishOptions(), sigma=0.3)
         state = in_unit_of(adjustment.solve(), truth)
         some = np.arange(0, len(problem.points), 5)
-        camera, covariance = adjustment.covariance(some)
+        marginals = adjustment.marginals()
+        camera, covariance = marginals.camera, marginals.inverse_distances(some)
         unit = np.concatenate([np.zeros((4, 3)), -state.translation[1:]], 1).ravel()
         poses.append(normalised(*without_unit(pose_errors(state, truth), camera[6:30, 6:30], unit)))
         difference = (state.inverse_distance - truth.inverse_distance)[some]
@@ -429,7 +432,7 @@ def test_covariance_of_the_focal_length():
         problem = make_problem("arc", frames=5, points=40, parallax=0.3, noise_px=0.2, seed=seed)
         adjustment = BundleAdjustment(problem.truth, problem.observations, options, sigma=0.2, free_focal=True)
         state = adjustment.solve()
-        camera, _ = adjustment.covariance(np.zeros(0, np.int64))
+        camera = adjustment.marginals().camera
         errors.append(state.log_focal[0] - problem.truth.log_focal[0])
         deviations.append(np.sqrt(camera[30, 30]))
     assert_calibrated([(e**2 / d**2, 1) for e, d in zip(errors, deviations, strict=True)])

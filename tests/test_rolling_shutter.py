@@ -13,10 +13,10 @@ from factorsfm import Frame, reconstruct
 from factorsfm.errors import InputError
 from factorsfm.export.folder import write_folder
 from factorsfm.images import ImageTracks, MappedImage
-from factorsfm.lens import READOUT, Lens, renormalized, through
+from factorsfm.lens import Lens, renormalized, through
 from factorsfm.options import Options, PolishOptions
 from factorsfm.polish import polish
-from factorsfm.problem import Observations, State
+from factorsfm.problem import READOUT, Observations, State
 from factorsfm.reconstruction import FrameStatus, ShotKind
 from factorsfm.refinement import BundleAdjustment
 from factorsfm.result import _rolling_shutter, _shutter_note
