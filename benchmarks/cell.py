@@ -26,10 +26,10 @@ from benchmarks.store import Record, cell_key, record_path, save
 from benchmarks.usage import cpu_seconds, peak_mb
 from factorsfm import MaskFolder, Options, Reconstruction, Stream
 from factorsfm.evaluation import baselines
-from factorsfm.evaluation.alignment import pose_arrays
 from factorsfm.evaluation.metrics import DepthErrors, parallax, point_depth_errors, trajectory_errors
 from factorsfm.evaluation.truth import Shot
-from factorsfm.image_set import ImageSet
+from factorsfm.imagesets.image_set import ImageSet
+from factorsfm.support.similarity import pose_arrays
 
 Array = NDArray[np.float64]
 

@@ -25,11 +25,11 @@ from benchmarks.plan import FULL
 from benchmarks.run import HERE, machine
 from benchmarks.usage import cpu_seconds
 from factorsfm import InputError, find_shots, read_result, reconstruct
-from factorsfm.evaluation.alignment import pose_arrays
 from factorsfm.evaluation.metrics import trajectory_errors
 from factorsfm.evaluation.truth import Shot
-from factorsfm.reconstruction import Reconstruction
-from factorsfm.threads import available_cores
+from factorsfm.result.reconstruction import Reconstruction
+from factorsfm.support.similarity import pose_arrays
+from factorsfm.support.threads import available_cores
 
 Image = NDArray[np.uint8]
 

@@ -43,8 +43,8 @@ from factorsfm import (
     ReconstructionError,
     Stream,
 )
-from factorsfm.evaluation.alignment import pose_arrays
 from factorsfm.evaluation.metrics import trajectory_errors
+from factorsfm.support.similarity import pose_arrays
 from factorsfm.synthetic import render_shot, simulate_prior
 
 Array = NDArray[np.float64]

@@ -25,15 +25,16 @@ from numpy.typing import NDArray
 
 import factorsfm
 from benchmarks.inputs import NETWORK_FILES
-from factorsfm.camera import normalized_from_pixels, pixels_from_normalized, with_focal, with_lens
+from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
+from factorsfm.adjustment.noise import coordinate_sigma
+from factorsfm.adjustment.observations import Observations
+from factorsfm.adjustment.state import State
+from factorsfm.camera.projection import normalized_from_pixels, pixels_from_normalized, with_focal, with_lens
 from factorsfm.evaluation.metrics import auc, relative_pose_errors
 from factorsfm.evaluation.readers import read_shot
 from factorsfm.evaluation.truth import Shot
-from factorsfm.lens import Lens, renormalized
-from factorsfm.noise import coordinate_sigma
-from factorsfm.options import PolishOptions
-from factorsfm.problem import Observations, State
-from factorsfm.refinement import BundleAdjustment
+from factorsfm.lens.lens import Lens, renormalized
+from factorsfm.support.options import PolishOptions
 
 _SEVEN, _TWO = ("d01", "d03", "d04", "d05", "d07", "d08", "d10"), ("d04", "d07")
 DISTORTIONS = {  # k1, k2, and shots

@@ -22,9 +22,9 @@ from benchmarks.plan import FULL, STUDIO
 from benchmarks.run import HERE, machine
 from benchmarks.usage import resident_mb
 from factorsfm import Frame, FrameUpdate, MaskFolder, Stream, open_source
-from factorsfm.evaluation.alignment import pose_arrays
 from factorsfm.evaluation.metrics import auc, trajectory_errors
 from factorsfm.evaluation.truth import Shot
+from factorsfm.support.similarity import pose_arrays
 from factorsfm.synthetic import RenderedShot, render_shot
 
 Array = NDArray[np.float64]

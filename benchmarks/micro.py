@@ -21,10 +21,12 @@ from benchmarks.inputs import NETWORK_FILES
 from benchmarks.markdown import table
 from benchmarks.run import HERE, machine
 from factorsfm import DepthModel, Frame, TrackerOptions
-from factorsfm.camera import normalized_from_pixels
-from factorsfm.evaluation.alignment import pose_arrays
+from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
+from factorsfm.adjustment.observations import Observations
+from factorsfm.adjustment.state import State
+from factorsfm.camera.projection import normalized_from_pixels
 from factorsfm.evaluation.metrics import trajectory_errors
-from factorsfm.factors import (
+from factorsfm.graph.factors import (
     depth_consistency_factor,
     image_depth_factor,
     native_affine,
@@ -33,17 +35,18 @@ from factorsfm.factors import (
     pose_from_camera,
     virtual_offset,
 )
-from factorsfm.graph import FactorGraph
-from factorsfm.images import ImageTracks, MappedImage
-from factorsfm.map_update import MapCopy, update_map
-from factorsfm.options import MapperOptions, PolishOptions
-from factorsfm.point_map import PointMap
-from factorsfm.problem import Observations, State
-from factorsfm.reconstruction import FrameStatus
-from factorsfm.refinement import BundleAdjustment
-from factorsfm.registration import ImageDepth, register_image
+from factorsfm.graph.keyframe_graph import FactorGraph
+from factorsfm.mapping.map_update import MapCopy, update_map
+from factorsfm.mapping.mapped_images import MappedImage
+from factorsfm.mapping.point_map import PointMap
+from factorsfm.mapping.registration import register_image
+from factorsfm.priors.image_depth import ImageDepth
+from factorsfm.support.options import MapperOptions, PolishOptions
+from factorsfm.support.similarity import pose_arrays
+from factorsfm.support.status import FrameStatus
 from factorsfm.synthetic import render_shot, synthetic_scene
 from factorsfm.tracks.flow import FlowTracker
+from factorsfm.tracks.image_tracks import ImageTracks
 
 Array = NDArray[np.float64]
 

@@ -25,11 +25,11 @@ from numpy.typing import NDArray
 import factorsfm
 from benchmarks.inputs import NETWORK_FILES
 from benchmarks.lens import Row, pose_auc, rows_table
-from factorsfm.evaluation.alignment import pose_arrays
 from factorsfm.evaluation.metrics import trajectory_errors
 from factorsfm.evaluation.readers import read_shot
 from factorsfm.evaluation.truth import Shot
-from factorsfm.options import ShutterUse
+from factorsfm.support.options import ShutterUse
+from factorsfm.support.similarity import pose_arrays
 from factorsfm.synthetic import read_by_rows
 
 READOUTS = {"d03": 0.9, "d05": 0.4, "d07": 0.6, "d10": 0.9}

@@ -30,13 +30,13 @@ import factorsfm
 from benchmarks.inputs import NETWORK_FILES, shot_folder
 from benchmarks.plan import KITCHEN, STUDIO, UNORDERED, WIDE_VIDEO
 from benchmarks.usage import peak_mb
-from factorsfm.evaluation.alignment import pose_arrays
 from factorsfm.evaluation.baselines import colmap_default, colmap_global, colmap_tuned, match_frames
 from factorsfm.evaluation.metrics import auc, relative_pose_errors, trajectory_errors
 from factorsfm.evaluation.readers import read_shot
 from factorsfm.evaluation.truth import Shot
+from factorsfm.imagesets.mapper import SetMapper
 from factorsfm.priors.masks import MaskFolder
-from factorsfm.set_mapper import SetMapper
+from factorsfm.support.similarity import pose_arrays
 from factorsfm.synthetic import render_views, room_camera
 
 RESULTS = Path(__file__).parent / "results"

@@ -5,33 +5,29 @@ import zlib  # noqa: F401  isort: skip
 import logging
 
 from factorsfm.api import reconstruct
-from factorsfm.camera import guess_camera, read_camera
-from factorsfm.control import Control, KnownDistance, KnownHeight, KnownPose, MarkedPoint, read_control
-from factorsfm.episode import Episode, ShotResult
-from factorsfm.errors import FactorsfmError, InputError, ModelError, ReconstructionError
-from factorsfm.explicit_graph import factor_graph
+from factorsfm.camera.files import read_camera
+from factorsfm.camera.guess import guess_camera
+from factorsfm.control.fit import ControlFit, ControlResidual
+from factorsfm.control.known import Control, KnownDistance, KnownHeight, KnownPose, MarkedPoint, read_control
 from factorsfm.export.options import ExportOptions, UpAxis
-from factorsfm.export.reading import read_result
-from factorsfm.extension import add_images
-from factorsfm.frame_update import FrameUpdate
-from factorsfm.frames import Frame, read_frames
-from factorsfm.live import Live, track
-from factorsfm.options import PRESETS, MapperOptions, Options, PolishOptions, TrackerOptions
+from factorsfm.frames.cuts import CutDetector, ShotUpdate, find_shots
+from factorsfm.frames.frame import Frame
+from factorsfm.frames.live_sources import RawFormat, Source, open_source
+from factorsfm.frames.reading import read_frames
+from factorsfm.graph.explicit_graph import factor_graph
+from factorsfm.imagesets.add_images import add_images
+from factorsfm.polish.observability import CameraObservability
 from factorsfm.priors.depth import DepthFolder, DepthKind, DepthMap, DepthModel, DepthPrior
 from factorsfm.priors.masks import MaskFolder, MaskModel, MaskPrior
-from factorsfm.reconstruction import (
-    CameraObservability,
-    ControlFit,
-    ControlResidual,
-    FrameResult,
-    FrameStatus,
-    PriorFit,
-    Reconstruction,
-    ShotKind,
-)
-from factorsfm.shots import CutDetector, ShotUpdate, find_shots
-from factorsfm.sources import RawFormat, Source, open_source
-from factorsfm.stream import Stream
+from factorsfm.result.reading import read_result
+from factorsfm.result.reconstruction import FrameResult, PriorFit, Reconstruction
+from factorsfm.streaming.episode import Episode, ShotResult
+from factorsfm.streaming.frame_update import FrameUpdate
+from factorsfm.streaming.live import Live, track
+from factorsfm.streaming.stream import Stream
+from factorsfm.support.errors import FactorsfmError, InputError, ModelError, ReconstructionError
+from factorsfm.support.options import PRESETS, MapperOptions, Options, PolishOptions, TrackerOptions
+from factorsfm.support.status import FrameStatus, ShotKind
 
 logging.getLogger(__name__).addHandler(logging.NullHandler())
 

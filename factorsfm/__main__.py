@@ -2,7 +2,7 @@
 
 import sys
 
-from factorsfm.cli import main
+from factorsfm.cli.main import main
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
@@ -14,17 +12,21 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.camera import open_camera
-from factorsfm.control import Control, find_frames, read_control
-from factorsfm.errors import InputError
-from factorsfm.frames import Frame, checked_range, list_images, range_text, read_frames
-from factorsfm.image_set import ImageSet
-from factorsfm.options import LensFreedom, Options, ShutterUse
+from factorsfm.camera.files import open_camera
+from factorsfm.control.known import Control, find_frames, read_control
+from factorsfm.frames.folders import list_images
+from factorsfm.frames.frame import Frame
+from factorsfm.frames.ranges import checked_range, range_text
+from factorsfm.frames.reading import read_frames
+from factorsfm.frames.unordered import looks_unordered, other_files, read_images
+from factorsfm.imagesets.image_set import ImageSet
+from factorsfm.imagesets.photo_folder import work_folder
 from factorsfm.priors.depth import DepthFolder, DepthKind, DepthPrior, open_depth
 from factorsfm.priors.masks import MaskFolder, MaskPrior, open_masks
-from factorsfm.reconstruction import Reconstruction
-from factorsfm.stream import Stream
-from factorsfm.unordered import looks_unordered, other_files, read_images
+from factorsfm.result.reconstruction import Reconstruction
+from factorsfm.streaming.stream import Stream
+from factorsfm.support.errors import InputError
+from factorsfm.support.options import LensFreedom, Options, ShutterUse
 
 Progress = Callable[[str, int, int | None], None]
 
@@ -163,16 +165,6 @@ def _from_images(
         result = images.finish(progress)
         check_matched(source, depth, masks)
         return result
-
-
-@contextmanager
-def work_folder(work: str | Path | None) -> Iterator[Path]:
-    """The folder, or a temporary one where there is none."""
-    if work is not None:
-        yield Path(work)
-        return
-    with tempfile.TemporaryDirectory(prefix="factorsfm-") as folder:
-        yield Path(folder)
 
 
 def check_matched(source: object, depth: DepthPrior | None, masks: MaskPrior | None) -> None:

@@ -5,12 +5,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pycolmap
 
-from factorsfm.camera import normalized_from_pixels
-from factorsfm.images import ImageTracks, MappedImage
-from factorsfm.problem import Observations, State
-from factorsfm.reconstruction import FrameStatus
-from factorsfm.registration import ImageDepth
+from factorsfm.adjustment.observations import Observations
+from factorsfm.adjustment.state import State
+from factorsfm.camera.projection import normalized_from_pixels
+from factorsfm.mapping.mapped_images import MappedImage
+from factorsfm.priors.image_depth import ImageDepth
+from factorsfm.support.status import FrameStatus
 from factorsfm.synthetic import synthetic_scene
+from factorsfm.tracks.image_tracks import ImageTracks
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
-from test_export import build
 
-from factorsfm.reconstruction import Reconstruction
+from factorsfm.result.reconstruction import Reconstruction
+from tests.export.test_export import build
 
 Array = NDArray[np.float64]
 

@@ -6,8 +6,8 @@ from functools import cache
 import numpy as np
 
 from factorsfm import PRESETS, DepthKind, DepthMap, Frame, Options, Reconstruction
-from factorsfm.evaluation.alignment import pose_arrays
 from factorsfm.evaluation.metrics import TrajectoryErrors, trajectory_errors
+from factorsfm.support.similarity import pose_arrays
 from factorsfm.synthetic import Motion, RenderedShot, render_shot, simulate_prior
 
 FRAMES = 8

@@ -7,14 +7,14 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from rendered import FRAMES, Maps, errors_of, quick_presets, rendered, simulated_maps
 
 import factorsfm
 from factorsfm import PRESETS, DepthModel, ShotKind
-from factorsfm.evaluation.alignment import pose_arrays
 from factorsfm.evaluation.metrics import TrajectoryErrors, trajectory_errors
 from factorsfm.evaluation.readers import Shot, read_shot
 from factorsfm.export.formats import export
+from factorsfm.support.similarity import pose_arrays
+from tests.rendered import FRAMES, Maps, errors_of, quick_presets, rendered, simulated_maps
 
 NETWORK = "tcmonodepth_tcsmallnet_192x320.onnx"
 FADE = 10  # frames
@@ -56,7 +56,7 @@ def test_a_handheld_shot_of_very_small_parallax(shared_data: Path, shared_models
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("motion", ["handheld", "arc"])
 def test_every_preset_registers_every_frame(motion, preset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("factorsfm.options.PRESETS", quick_presets())
+    monkeypatch.setattr("factorsfm.support.options.PRESETS", quick_presets())
     shot = rendered(motion)
     result = factorsfm.reconstruct(shot.images, camera=shot.camera, depth=Maps(simulated_maps(motion)), preset=preset)
     errors = errors_of(result, shot)

@@ -15,12 +15,13 @@ import cv2
 import numpy as np
 import pytest
 from onnx import helper
-from test_models import save_network
 
-from factorsfm import PRESETS, DepthKind, FrameStatus, ShotKind, cli, read_camera, read_control, reconstruct
+from factorsfm import PRESETS, DepthKind, FrameStatus, ShotKind, read_camera, read_control, reconstruct
+from factorsfm.cli import main as cli
 from factorsfm.export import FORMATS
 from factorsfm.priors import models
 from factorsfm.synthetic import render_shot, write_shot
+from tests.priors.test_models import save_network
 
 ROOT = Path(__file__).resolve().parents[1]
 TEXT = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -1,1 +1,4 @@
-"""Films and folders of films: every shot found, reconstructed by several processes, and listed on one page."""
+"""Films: the plan of shots, the workers, the index page over all results.
+
+Takes videos, gives a result folder for every shot. May import `api` and what lies below it.
+"""

@@ -10,7 +10,7 @@ from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future
 from contextlib import AbstractContextManager, contextmanager
 from typing import Any, Generic, TypeVar
 
-from factorsfm.errors import FactorsfmError, InputError
+from factorsfm.support.errors import FactorsfmError, InputError
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")

@@ -18,11 +18,12 @@ import cv2
 import numpy as np
 
 from factorsfm.batch.plan import Job, Video
-from factorsfm.errors import InputError
-from factorsfm.export.folder import check_directory
 from factorsfm.report.document import document, packaged
+from factorsfm.report.result_folder import check_directory
 from factorsfm.report.wording import grade_of
-from factorsfm.summary import PROGRAM, json_text, program_version
+from factorsfm.support.errors import InputError
+from factorsfm.support.json_text import json_text
+from factorsfm.support.program import PROGRAM, program_version
 
 _THUMBNAIL_WIDTH = 240
 _QUALITY = 70  # of JPEG

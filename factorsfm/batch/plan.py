@@ -11,13 +11,13 @@ from typing import Any
 
 import pycolmap
 
-from factorsfm.camera import camera_to_json
-from factorsfm.errors import InputError
-from factorsfm.frames import list_files
-from factorsfm.options import LensFreedom, ShutterUse
+from factorsfm.camera.files import camera_to_json
+from factorsfm.frames.cuts import find_shots
+from factorsfm.frames.folders import list_files
 from factorsfm.priors.masks import MaskFolder
-from factorsfm.shots import find_shots
-from factorsfm.summary import json_text
+from factorsfm.support.errors import InputError
+from factorsfm.support.json_text import json_text
+from factorsfm.support.options import LensFreedom, ShutterUse
 
 VIDEO_SUFFIXES = (
     *(".avi", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg"),

@@ -8,9 +8,9 @@ from contextlib import nullcontext
 
 from factorsfm import api
 from factorsfm.batch.plan import Job, Video, shots_of
-from factorsfm.errors import FactorsfmError, ReconstructionError
-from factorsfm.export.folder import write_failure, write_folder
-from factorsfm.threads import OneThreadEach
+from factorsfm.report.result_folder import write_failure, write_folder
+from factorsfm.support.errors import FactorsfmError, ReconstructionError
+from factorsfm.support.threads import OneThreadEach
 
 Progress = Callable[[str, int, int | None], None]
 

@@ -1,9 +1,9 @@
 """Metrics, data-set readers and baselines: everything that judges a reconstruction.
 
-The metrics take and give numpy arrays; `pose_arrays` makes them of poses.
+Takes and gives numpy arrays; `pose_arrays` makes them of poses. May import `api` and what lies below it; no room but
+the command line imports it.
 """
 
-from factorsfm.evaluation.alignment import Similarity, align, pose_arrays
 from factorsfm.evaluation.metrics import (
     DepthErrors,
     TrajectoryErrors,
@@ -16,6 +16,7 @@ from factorsfm.evaluation.metrics import (
 )
 from factorsfm.evaluation.readers import read_7scenes, read_colmap, read_eth3d, read_shot, read_studiosfm, read_tum
 from factorsfm.evaluation.truth import Shot
+from factorsfm.support.similarity import Similarity, align, pose_arrays
 
 __all__ = [
     "DepthErrors",

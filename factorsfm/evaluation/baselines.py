@@ -13,11 +13,11 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.errors import InputError
-from factorsfm.evaluation.alignment import pose_arrays
 from factorsfm.evaluation.truth import Shot
-from factorsfm.frames import Frame
+from factorsfm.frames.frame import Frame
 from factorsfm.priors.masks import MaskFolder
+from factorsfm.support.errors import InputError
+from factorsfm.support.similarity import pose_arrays
 
 Array = NDArray[np.float64]
 

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.errors import InputError
-from factorsfm.frames import Frame
+from factorsfm.frames.frame import Frame
+from factorsfm.support.errors import InputError
 
 
 def degrade(

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from factorsfm.errors import InputError
-from factorsfm.evaluation.alignment import Similarity, align, check_trajectories, registered_frames
+from factorsfm.support.errors import InputError
+from factorsfm.support.similarity import Similarity, align, check_trajectories, registered_frames
 
 Array = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ import pickle
 from pathlib import Path
 from typing import Any
 
-from factorsfm.errors import InputError
+from factorsfm.support.errors import InputError
 
 # Everything that a pickle of arrays, dtypes, numpy scalars and plain containers names.
 _ALLOWED = {

@@ -16,12 +16,13 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.camera import read_camera
-from factorsfm.errors import InputError
-from factorsfm.evaluation.alignment import nearest_rotation, pose_arrays
+from factorsfm.camera.files import read_camera
 from factorsfm.evaluation.plain_pickle import load_plain_pickle
 from factorsfm.evaluation.truth import DepthLookup, DepthMaps, RawDepthMaps, Shot, no_depth, read_image
-from factorsfm.frames import IMAGE_SUFFIXES
+from factorsfm.frames.folders import IMAGE_SUFFIXES
+from factorsfm.support.errors import InputError
+from factorsfm.support.rotations import nearest_rotation
+from factorsfm.support.similarity import pose_arrays
 
 logger = logging.getLogger(__name__)
 

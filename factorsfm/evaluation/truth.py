@@ -11,8 +11,9 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.errors import InputError
-from factorsfm.frames import Frame, read_frames
+from factorsfm.frames.frame import Frame
+from factorsfm.frames.reading import read_frames
+from factorsfm.support.errors import InputError
 
 Array = NDArray[np.float64]
 DepthLookup = Callable[[int], NDArray[np.float32] | None]

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.frames import Frame
+from factorsfm.frames.frame import Frame
 from factorsfm.priors.depth import DepthKind, DepthMap
 
 _SIZE = (96, 160)  # resolution of the maps; they are smooth

@@ -11,7 +11,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.reconstruction import Reconstruction
+from factorsfm.result.reconstruction import Reconstruction
 
 
 class _Observations(NamedTuple):

@@ -7,9 +7,9 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from factorsfm.errors import InputError
 from factorsfm.export.shot import Shot
-from factorsfm.frames import IMAGE_SUFFIXES
+from factorsfm.frames.folders import IMAGE_SUFFIXES
+from factorsfm.support.errors import InputError
 
 logger = logging.getLogger(__name__)
 

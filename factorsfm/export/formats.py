@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from factorsfm.errors import InputError
 from factorsfm.export.after_effects import write_after_effects
 from factorsfm.export.alembic import write_alembic
 from factorsfm.export.blender import write_blender
@@ -20,7 +19,8 @@ from factorsfm.export.stmap import write_stmaps, write_undistorted
 from factorsfm.export.trajectory import write_kitti, write_tum
 from factorsfm.export.usd import write_usd
 from factorsfm.export.writing import complete_file, complete_folder
-from factorsfm.reconstruction import Reconstruction
+from factorsfm.result.reconstruction import Reconstruction
+from factorsfm.support.errors import InputError
 
 _AS_RECONSTRUCTED = Defaults()
 

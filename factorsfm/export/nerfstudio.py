@@ -12,11 +12,11 @@ import cv2
 import numpy as np
 import pycolmap
 
-from factorsfm.errors import InputError
 from factorsfm.export.ply import write_ply
 from factorsfm.export.shot import Shot
-from factorsfm.frames import read_frames
-from factorsfm.summary import json_text
+from factorsfm.frames.reading import read_frames
+from factorsfm.support.errors import InputError
+from factorsfm.support.json_text import json_text
 
 logger = logging.getLogger(__name__)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
-from factorsfm.errors import InputError
+from factorsfm.support.errors import InputError
 
 
 class UpAxis(StrEnum):

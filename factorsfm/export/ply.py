@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from factorsfm.reconstruction import Reconstruction
+from factorsfm.result.reconstruction import Reconstruction
 
 _VERTEX = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")])
 

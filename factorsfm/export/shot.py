@@ -17,7 +17,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from factorsfm.export.options import ExportOptions, UpAxis
-from factorsfm.reconstruction import FrameResult, Reconstruction
+from factorsfm.result.reconstruction import FrameResult, Reconstruction
 
 _TURNED_WORLD = {  # exported world from the reconstruction's
     UpAxis.MINUS_Y: np.eye(3),

@@ -9,11 +9,11 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.camera import PIXEL_CENTER
-from factorsfm.errors import InputError
+from factorsfm.camera.projection import PIXEL_CENTER
 from factorsfm.export.shot import Shot
 from factorsfm.export.vfx import failures_as_os_errors, require
-from factorsfm.frames import read_frames
+from factorsfm.frames.reading import read_frames
+from factorsfm.support.errors import InputError
 
 Array = NDArray[np.float64]
 

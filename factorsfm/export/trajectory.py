@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from factorsfm.export.shot import Shot
-from factorsfm.reconstruction import FrameResult, Reconstruction
+from factorsfm.result.reconstruction import FrameResult, Reconstruction
 
 
 def write_trajectory(reconstruction: Reconstruction, path: str | Path) -> None:

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from factorsfm.errors import InputError
 from factorsfm.export.options import UpAxis
 from factorsfm.export.shot import Shot
 from factorsfm.export.vfx import failures_as_os_errors, require
+from factorsfm.support.errors import InputError
 
 CAMERA, POINTS = "/factorsfm/camera", "/factorsfm/points"
 

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from importlib import import_module
 from typing import Any
 
-from factorsfm.errors import InputError
+from factorsfm.support.errors import InputError
 
 _EXTRA_OF_MODULE = {"OpenEXR": "vfx", "pxr": "vfx", "alembic3d": "alembic", "imath": "alembic"}
 

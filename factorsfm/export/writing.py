@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from factorsfm.errors import InputError
-from factorsfm.summary import PROGRAM
+from factorsfm.support.errors import InputError
+from factorsfm.support.program import PROGRAM
 
 
 @contextmanager

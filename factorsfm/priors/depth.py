@@ -15,10 +15,11 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from factorsfm.errors import InputError, ModelError
-from factorsfm.frames import IMAGE_SUFFIXES, Frame
+from factorsfm.frames.folders import IMAGE_SUFFIXES
+from factorsfm.frames.frame import Frame
 from factorsfm.priors.models import MODELS, find_model
 from factorsfm.priors.networks import Network, NetworkSpec, network_family
+from factorsfm.support.errors import InputError, ModelError
 
 logger = logging.getLogger(__name__)
 

@@ -11,11 +11,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.errors import InputError, ModelError
-from factorsfm.frames import Frame
+from factorsfm.frames.frame import Frame
 from factorsfm.priors.depth import FrameFiles, check_aspect, image_stem
 from factorsfm.priors.models import find_model
 from factorsfm.priors.networks import Network, NetworkSpec
+from factorsfm.support.errors import InputError, ModelError
 
 # What moves in PASCAL VOC: aeroplane, bicycle, boat, bus, car, cat, dog, horse, motorbike, person, train.
 MOVABLE_LABELS = frozenset({1, 2, 4, 6, 7, 8, 12, 13, 14, 15, 19})

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pooch
 
-from factorsfm.errors import ModelError
+from factorsfm.support.errors import ModelError
 
 logger = logging.getLogger(__name__)
 

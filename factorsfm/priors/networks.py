@@ -13,8 +13,8 @@ import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
-from factorsfm.errors import ModelError
 from factorsfm.priors.models import named_model
+from factorsfm.support.errors import ModelError
 
 logger = logging.getLogger(__name__)
 

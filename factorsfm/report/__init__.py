@@ -1,4 +1,7 @@
-"""What a person looks at: the HTML report and the picture."""
+"""What a person looks at: the HTML report, the overlay, the picture, and the folder of a result.
+
+Takes a `Reconstruction`, gives files. May import `export` and what lies below it.
+"""
 
 from factorsfm.report.page import failure_html, report_html
 from factorsfm.report.picture import draw_picture

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.reconstruction import FrameResult
+from factorsfm.result.reconstruction import FrameResult
 
 _Item = TypeVar("_Item")
 

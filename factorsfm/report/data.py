@@ -10,10 +10,10 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.reconstruction import FrameResult, Reconstruction
 from factorsfm.report.charts import charts
 from factorsfm.report.geometry import Tracks, median_prior_residuals, scene, tracks
 from factorsfm.report.wording import status_words
+from factorsfm.result.reconstruction import FrameResult, Reconstruction
 
 _MAX_POINTS = 20_000
 _MAX_OBSERVATIONS = 150_000

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.camera import PIXEL_CENTER
-from factorsfm.reconstruction import Reconstruction
+from factorsfm.camera.projection import PIXEL_CENTER
+from factorsfm.result.reconstruction import Reconstruction
 
 
 @dataclass(frozen=True, slots=True)

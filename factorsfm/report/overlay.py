@@ -11,15 +11,16 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.camera import PIXEL_CENTER
-from factorsfm.errors import InputError
+from factorsfm.camera.projection import PIXEL_CENTER
 from factorsfm.export.options import ExportOptions
 from factorsfm.export.shot import Defaults, make_shot
 from factorsfm.export.writing import complete_file
-from factorsfm.frames import Frame, read_frames
-from factorsfm.reconstruction import FrameResult, Reconstruction
+from factorsfm.frames.frame import Frame
+from factorsfm.frames.reading import read_frames
 from factorsfm.report.props import Props, place_props
 from factorsfm.report.wording import status_words
+from factorsfm.result.reconstruction import FrameResult, Reconstruction
+from factorsfm.support.errors import InputError
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]

@@ -10,7 +10,6 @@ from platform import python_version
 from string import Template
 from typing import Any
 
-from factorsfm.reconstruction import FrameResult, Reconstruction
 from factorsfm.report.data import frames_data, reconstruction_data
 from factorsfm.report.document import document, packaged
 from factorsfm.report.wording import (
@@ -20,7 +19,10 @@ from factorsfm.report.wording import (
     status_words,
     verdict_sentence,
 )
-from factorsfm.summary import PROGRAM, focal_range, json_text, program_version, with_total
+from factorsfm.result.reconstruction import FrameResult, Reconstruction
+from factorsfm.result.summary import focal_range, with_total
+from factorsfm.support.json_text import json_text
+from factorsfm.support.program import PROGRAM, program_version
 
 _SCRIPTS = ("base.js", "view.js", "footage.js", "charts.js", "page.js")
 _LIBRARIES = ("gtsam", "pycolmap", "opencv-python-headless", "onnxruntime", "numpy")

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.reconstruction import Reconstruction
 from factorsfm.report.geometry import Scene, scene
-from factorsfm.summary import verdict
+from factorsfm.result.reconstruction import Reconstruction
+from factorsfm.result.summary import verdict
 
 _WIDTH, _HEIGHT = 1280, 720
 _PAGE, _CARD, _LINE = (244, 246, 246), (255, 255, 255), (224, 226, 225)

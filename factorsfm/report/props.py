@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.errors import InputError
-from factorsfm.reconstruction import Reconstruction
+from factorsfm.result.reconstruction import Reconstruction
+from factorsfm.support.errors import InputError
 
 Array = NDArray[np.float64]
 

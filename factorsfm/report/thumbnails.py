@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.reconstruction import FrameResult
+from factorsfm.result.reconstruction import FrameResult
 
 _WIDTH = 384
 _QUALITY = 60  # of JPEG

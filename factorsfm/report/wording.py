@@ -7,8 +7,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from factorsfm.reconstruction import FrameResult, FrameStatus, Reconstruction, ShotKind
-from factorsfm.summary import median_reprojection_error, registered_share
+from factorsfm.result.reconstruction import FrameResult, Reconstruction
+from factorsfm.result.summary import median_reprojection_error, registered_share
+from factorsfm.support.status import FrameStatus, ShotKind
 
 _DOUBTFUL_PX = 1.0  # median reprojection error; tracks are good to a tenth of a pixel
 _NO_SHARE = 0.05  # of the depth prior, below which it is not worth a word

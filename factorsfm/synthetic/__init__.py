@@ -1,4 +1,7 @@
-"""Synthetic shots with exact truth: projected points, and a rendered room with video, depth and poses."""
+"""Synthetic shots with exact truth: projected points, and a rendered room with video, depth and poses.
+
+Takes a motion, gives frames with their truth. May import `camera` and what lies below it.
+"""
 
 from factorsfm.synthetic.rolling import read_by_rows
 from factorsfm.synthetic.scene import Motion, SyntheticScene, room_camera, synthetic_scene

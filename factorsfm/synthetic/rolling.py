@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.camera import PIXEL_CENTER, normalized_from_pixels, pixels_from_normalized
+from factorsfm.camera.projection import PIXEL_CENTER, normalized_from_pixels, pixels_from_normalized
 from factorsfm.synthetic.scene import Floats
 
 _ROUNDS = 3  # from what is seen at the time of a row back to what the image shows

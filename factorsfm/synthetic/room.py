@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.camera import PIXEL_CENTER
+from factorsfm.camera.projection import PIXEL_CENTER
 from factorsfm.synthetic.scene import FIELD_OF_VIEW, Floats
 
 

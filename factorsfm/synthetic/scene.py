@@ -12,8 +12,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.camera import PIXEL_CENTER
-from factorsfm.errors import InputError
+from factorsfm.camera.projection import PIXEL_CENTER
+from factorsfm.support.errors import InputError
 
 Motion = Literal["dolly", "truck", "handheld", "rotation", "static", "arc"]
 Floats = NDArray[np.float64]

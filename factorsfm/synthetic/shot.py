@@ -12,8 +12,9 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.camera import camera_to_json, with_focal
-from factorsfm.errors import InputError
+from factorsfm.camera.files import camera_to_json
+from factorsfm.camera.projection import with_focal
+from factorsfm.support.errors import InputError
 from factorsfm.synthetic.rolling import read_by_rows
 from factorsfm.synthetic.room import Room
 from factorsfm.synthetic.scene import Floats, Motion, camera_path, room_camera

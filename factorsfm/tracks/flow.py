@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.options import TrackerOptions
+from factorsfm.support.options import TrackerOptions
 from factorsfm.tracks.grey import GreyFrame, exposed_as
 from factorsfm.tracks.local_motion import LocalMotion
 from factorsfm.tracks.patches import Array, BirthPatches, in_parts

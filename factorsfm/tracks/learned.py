@@ -17,10 +17,10 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.camera import PIXEL_CENTER
-from factorsfm.errors import ModelError
+from factorsfm.camera.projection import PIXEL_CENTER
 from factorsfm.priors.models import MODELS_VARIABLE, model_folders
 from factorsfm.priors.networks import open_session
+from factorsfm.support.errors import ModelError
 
 Floats = NDArray[np.float32]
 Index = NDArray[np.int64]
@@ -32,7 +32,7 @@ _MULTIPLE_OF = 32  # of the network's input
 _KEYPOINTS = 2048  # an image: the matcher's cost grows with their square
 _LEAST_SCORE = 0.1  # of a match
 _STRONGEST = 512  # keypoints by which two images are compared before they are matched
-_ALIKE = 0.82  # cosine of descriptors that count as the same in this comparison, as XFeat's authors have it
+_SAME_FEATURE = 0.82  # cosine of descriptors that count as the same in this comparison, as XFeat's authors have it
 _LEAST_MATCHES = 15  # that a pair must have to be verified
 
 
@@ -134,7 +134,7 @@ def likeness(images: Sequence[Keypoints]) -> Index:
                 cosine = strongest[i] @ strongest[j].T
                 there, back = cosine.argmax(1), cosine.argmax(0)
                 best = cosine[np.arange(len(there)), there]
-                alike[i, j] = ((back[there] == np.arange(len(there))) & (best > _ALIKE)).sum()
+                alike[i, j] = ((back[there] == np.arange(len(there))) & (best > _SAME_FEATURE)).sum()
     return alike + alike.T
 
 

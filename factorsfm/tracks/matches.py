@@ -16,7 +16,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.camera import PIXEL_CENTER
+from factorsfm.camera.projection import PIXEL_CENTER
 from factorsfm.tracks.learned import LearnedFeatures, find_all, likeness, match_pairs
 
 Array = NDArray[np.float64]

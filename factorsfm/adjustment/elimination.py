@@ -1,0 +1,209 @@
+"""Normal equations of residuals on cameras and points, and the elimination of the points from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorsfm.adjustment.track_errors import STRETCH, TrackErrors
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+# Camera-point block of the information matrix (columns, 3 n), its columns, and its points.
+Block = tuple[Array, Index, slice]
+# Rows of a frame, their columns, and the position of each entry among the columns; None: they are in order everywhere.
+Group = tuple[Index, Index, Index | None]
+# Flat positions of values, and whether no two have the same one.
+Places = tuple[NDArray[np.intp], bool]
+
+_CHUNK = 512  # points eliminated together
+_ROWS = 16  # of a block worked on at once: they stay in the processor's cache
+
+
+@dataclass(frozen=True)
+class Term:
+    """Linearised residuals, the observations along the last axis (contiguous, so that numpy runs at full speed).
+
+    Attributes:
+        residual: (d, m); by_camera: (c, d, m); by_point: (3, d, m).
+        columns: (m, c) camera-side variables of `by_camera`; frame, point: (m,).
+        errors: how the residuals repeat each other; they are decorrelated then, the derivatives are not. None: not.
+    """
+
+    residual: Array
+    by_camera: Array
+    columns: Index
+    by_point: Array
+    frame: Index
+    point: Index
+    errors: TrackErrors | None = None
+
+    @cached_property
+    def decorrelated_by_point(self) -> Array:
+        return self.by_point if self.errors is None else self.errors.decorrelated(self.by_point)
+
+
+@dataclass(slots=True)
+class Normal:
+    """Normal equations before the points are eliminated."""
+
+    camera: Array  # (c, c)
+    camera_gradient: Array  # (c,)
+    point: Array  # (n, 3, 3)
+    point_gradient: Array  # (n, 3)
+    terms: list[Term]
+
+
+class Elimination:
+    """Sums and blocks over residuals whose variables are the same at every linearisation.
+
+    Args:
+        columns, points: how many variables the camera side has, and how many points there are.
+    """
+
+    def __init__(self, columns: int, points: int) -> None:
+        self._columns, self._points = columns, points
+        self._groups: list[tuple[list[Group], Index, Index]] | None = None
+        self._chunks: list[tuple[list[Places], Index, slice]] | None = None
+
+    def normal_equations(self, terms: list[Term], *, cameras: bool = True) -> Normal:
+        """Information and gradient of the cameras, if wanted, and of each point; each term is sorted by point."""
+        c, n = self._columns, self._points
+        camera, gradient = np.zeros((c, c)), np.zeros(c)
+        point, point_gradient = np.zeros((n, 3, 3)), np.zeros((n, 3))
+        for t, (groups, seen, first) in zip(terms, self._frame_groups(terms), strict=True):
+            for rows, columns, local in groups if cameras else []:
+                dense = t.by_camera.take(rows, axis=2)
+                if local is not None:
+                    entries, dense = dense, np.zeros((len(columns), *dense.shape[1:]))
+                    np.put_along_axis(dense, np.broadcast_to(local.T[:, None], entries.shape), entries, 0)
+                dense = dense.reshape(len(columns), dense.shape[1] * len(rows))
+                camera[np.ix_(columns, columns)] += dense @ dense.T
+                gradient[columns] += dense @ t.residual[:, rows].ravel()
+            if t.errors is not None and cameras:
+                self._take_away_repeated(camera, t, t.errors, groups)
+            by_point = t.decorrelated_by_point
+            for i in range(3):
+                point_gradient[seen, i] += np.add.reduceat((t.by_point[i] * t.residual).sum(0), first)
+                for j in range(i, 3):
+                    sums = np.add.reduceat((t.by_point[i] * by_point[j]).sum(0), first)
+                    point[seen, i, j] += sums
+                    if j > i:
+                        point[seen, j, i] += sums
+        return Normal(camera, gradient, point, point_gradient, terms)
+
+    def _take_away_repeated(self, camera: Array, t: Term, errors: TrackErrors, groups: list[Group]) -> None:
+        """From the information of the cameras, what residuals of a stretch say again and again."""
+        frames = np.array([t.frame[rows[0]] for rows, _, _ in groups])
+        scale = errors.root_weight * np.sqrt(errors.shared)[errors.stretch]
+        for window in np.unique(frames // STRETCH):
+            mine = [groups[k] for k in np.nonzero(frames // STRETCH == window)[0]]
+            occurring, _ = self._occurring(*(columns for _, columns, _ in mine))
+            seen = np.unique(errors.stretch[np.concatenate([rows for rows, _, _ in mine])])
+            total = np.zeros((len(occurring), len(t.residual), len(seen)))
+            for rows, columns, local in mine:
+                at = np.searchsorted(occurring, columns)
+                at = at[:, None] if local is None else at[local.T]
+                place = np.searchsorted(seen, errors.stretch[rows])
+                for d in range(total.shape[1]):
+                    total[at, d, place] += t.by_camera[:, d, rows] * scale[rows]
+            flat = total.reshape(len(occurring), -1)
+            camera[np.ix_(occurring, occurring)] -= flat @ flat.T
+
+    def _frame_groups(self, terms: list[Term]) -> list[tuple[list[Group], Index, Index]]:
+        """For every term: its rows by frame; the points that occur, and the first row of each."""
+        if self._groups is None:
+            self._groups = []
+            for t in terms:
+                order = np.argsort(t.frame, kind="stable")
+                groups: list[Group] = []
+                for rows in np.split(order, np.nonzero(np.diff(t.frame[order]))[0] + 1):
+                    mine = t.columns[rows]
+                    columns, (local,) = self._occurring(mine)
+                    same = local.shape[1] == len(columns) and bool((local == np.arange(len(columns))).all())
+                    groups.append((rows, columns, None if same else local))
+                self._groups.append((groups, *np.unique(t.point, return_index=True)))
+        return self._groups
+
+    def _chunk_indices(self, terms: list[Term]) -> list[tuple[list[Places], Index, slice]]:
+        """For every chunk of points: places of each term's values in the cross blocks, the columns, the points."""
+        if self._chunks is None:
+            self._chunks = []
+            n = self._points
+            for begin in range(0, n, _CHUNK):
+                end = min(n, begin + _CHUNK)
+                rows = [slice(*np.searchsorted(t.point, [begin, end])) for t in terms]
+                columns, locals_ = self._occurring(*(t.columns[r] for t, r in zip(terms, rows, strict=True)))
+                flat = []
+                for t, r, local in zip(terms, rows, locals_, strict=True):
+                    position = local.T[:, None] * 3 * (end - begin) + 3 * (t.point[r] - begin)
+                    position = (position + np.arange(3)[:, None]).ravel()
+                    flat.append((position, np.bincount(position, minlength=1).max() <= 1))
+                self._chunks.append((flat, columns, slice(begin, end)))
+        return self._chunks
+
+    def _occurring(self, *columns: Index) -> tuple[Index, list[Index]]:
+        """The columns that occur (ascending), and where among them each of the given ones is."""
+        occurs = np.zeros(self._columns, bool)
+        for some in columns:
+            occurs[some] = True
+        place = np.cumsum(occurs) - 1
+        return np.flatnonzero(occurs), [place[some] for some in columns]
+
+    def cross_blocks(self, normal: Normal) -> list[Block]:
+        """Camera-point blocks of the information matrix, dense over the columns of each chunk."""
+        blocks = []
+        for flat, columns, span in self._chunk_indices(normal.terms):
+            n = span.stop - span.start
+            cross = np.zeros(len(columns) * 3 * n)
+            for t, (position, single) in zip(normal.terms, flat, strict=True):
+                rows = slice(*np.searchsorted(t.point, [span.start, span.stop]))
+                by_point = t.decorrelated_by_point[:, :, rows]
+                values = np.einsum("cdm,pdm->cpm", t.by_camera[:, :, rows], by_point).ravel()
+                if single:
+                    cross[position] += values
+                else:
+                    cross += np.bincount(position, values, len(cross))
+            blocks.append((cross.reshape(len(columns), 3 * n), columns, span))
+        return blocks
+
+
+def reduced(normal: Normal, blocks: list[Block], damping: float) -> tuple[Array, Array, Array]:
+    """Information and gradient of the camera side with the points eliminated, and the points' covariance."""
+    point = normal.point.copy()
+    diagonal = np.einsum("nii->ni", point)
+    diagonal += damping * diagonal + 1e-12
+    point_covariance = np.asarray(np.linalg.inv(point), np.float64)
+    root = np.asarray(np.linalg.cholesky(point_covariance), np.float64)
+    information = normal.camera.copy()
+    information[np.diag_indices_from(information)] *= 1.0 + damping
+    gradient = normal.camera_gradient.copy()
+    for cross, columns, span in blocks:
+        half = _rooted(cross, root[span])
+        information[np.ix_(columns, columns)] -= half @ half.T
+        step = np.einsum("nij,nj->ni", point_covariance[span], normal.point_gradient[span])
+        gradient[columns] -= cross @ step.ravel()
+    return information, gradient, point_covariance
+
+
+def _rooted(cross: Array, root: Array) -> Array:
+    """(c, 3 n) cross blocks, the columns of each point times its lower triangular (3, 3) root, in another order."""
+    n = len(root)
+    half = np.empty((len(cross), 3, n))
+    (a, _, _), (b, d, _), (c, e, f) = root.transpose(1, 2, 0)
+    for begin in range(0, len(cross), _ROWS):
+        x, y, z = np.ascontiguousarray(cross[begin : begin + _ROWS].reshape(-1, n, 3).transpose(2, 0, 1))
+        part = half[begin : begin + _ROWS]
+        part[:, 0] = x * a + y * b + z * c
+        part[:, 1] = y * d + z * e
+        part[:, 2] = z * f
+    return half.reshape(len(cross), 3 * n)
+
+
+def conditioned(information: Array) -> Array:
+    """The matrix with a ridge far below any information that matters."""
+    return np.asarray(information + np.diag(1e-12 * np.maximum(information.diagonal(), 1e-300)))

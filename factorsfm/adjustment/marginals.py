@@ -1,0 +1,129 @@
+"""Covariances of the polish, and what they are relative to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorsfm.adjustment.state import State
+from factorsfm.support.rotations import cross_matrices
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Marginals:
+    """Uncertainty of a `BundleAdjustment` whose only held pose is the first.
+
+    Attributes:
+        camera: (c, c) covariance of the camera side, columns as in `BundleAdjustment.marginals`.
+        point: (n, 3, 3) covariance of each point given the camera side: two tangent directions of the bearing (see
+            `tangent_basis`), inverse distance.
+        blocks: camera-point blocks of the information matrix with their columns, by span of points.
+    """
+
+    camera: Array
+    point: Array
+    blocks: list[tuple[Array, Index, slice]]
+
+    def relative(self, motion: Array, measured: Array) -> Array:
+        """Covariance of the camera side when the coordinates are carried along with the points.
+
+        Args:
+            motion: (c, g) movement of the camera side by each of g movements of the coordinates.
+            measured: (n, 3, g) how each movement is measured, as a combination of the points' changes.
+        """
+        pull = np.zeros((measured.shape[2], len(self.camera)))
+        weighted = self.point @ measured
+        for cross, columns, span in self.blocks:
+            pull[:, columns] -= (cross @ weighted[span].reshape(-1, measured.shape[2])).T
+        moved = pull @ self.camera
+        spread = moved @ pull.T + np.einsum("nig,nih->gh", measured, weighted)
+        mixed = motion @ moved
+        return np.asarray(self.camera - mixed - mixed.T + motion @ spread @ motion.T)
+
+    def inverse_distances(self, points: Index) -> Array:
+        """(p, p) joint covariance of the inverse distances of some points."""
+        gain = np.zeros((len(points), len(self.camera)))
+        for cross, columns, span in self.blocks:
+            inside = np.nonzero((points >= span.start) & (points < span.stop))[0]
+            local = points[inside] - span.start
+            picked = cross.reshape(len(columns), -1, 3)[:, local]
+            gain[np.ix_(inside, columns)] = np.einsum("cpi,pi->pc", picked, self.point[points[inside], 2])
+        joint = gain @ self.camera @ gain.T
+        joint[np.diag_indices_from(joint)] += self.point[points, 2, 2]
+        return np.asarray(joint)
+
+    def inverse_distance_std(self, camera: Array) -> Array:
+        """(n,) standard deviations of the inverse distances.
+
+        Args:
+            camera: (c, c) covariance of the camera side, as it is or as `relative` gives it.
+        """
+        variance = self.point[:, 2, 2].copy()
+        for cross, columns, span in self.blocks:
+            gain = np.einsum("cni,ni->nc", cross.reshape(len(columns), -1, 3), self.point[span, 2])
+            variance[span] += np.einsum("nc,nc->n", gain @ camera[np.ix_(columns, columns)], gain)
+        return np.sqrt(variance)
+
+
+def in_scene_unit(marginals: Marginals, state: State) -> Array:
+    """Covariance of the camera side relative to the first camera, in the scene's unit of length.
+
+    Only weak priors hold the unit. Here it is the mean inverse distance of the points: the errors are those that
+    remain when a solution is scaled to the true mean.
+    """
+    motion = np.zeros((len(marginals.camera), 1))
+    lens, images = 6 * len(state.rotation), len(state.scale)
+    affine = lens + len(state.log_focal)
+    field = affine + 2 * images
+    motion[:lens, 0].reshape(-1, 6)[:, 3:] = state.translation
+    motion[affine:field:2, 0] = -state.scale
+    motion[field : field + len(state.field), 0] = state.field
+    measured = np.zeros((len(state.bearing), 3, 1))
+    measured[:, 2] = 1.0 / state.inverse_distance.sum()
+    return marginals.relative(motion, measured)
+
+
+def scene_weights(marginals: Marginals, state: State) -> Array:
+    """(n,) how much each point counts in the place of the scene: less if it is far away or badly determined."""
+    w, variance = state.inverse_distance, marginals.point[:, 2, 2]
+    far = np.median(w) ** 2 / np.maximum(w, 1e-9) ** 2
+    return np.asarray(np.sqrt(np.median(variance) / np.maximum(variance, np.median(variance))) / (1.0 + far))
+
+
+def in_scene(marginals: Marginals, state: State, weights: Array) -> Array:
+    """(6 k, 6 k) covariance of the poses relative to the scene as a whole.
+
+    The coordinates (position, orientation, unit of length) are those in which the points are where they should be in
+    the least-squares sense, with `weights` (n,) on their distances.
+    """
+    frames, points, w = len(state.rotation), state.points, np.maximum(state.inverse_distance, 1e-9)
+    moved = np.concatenate([np.tile(np.eye(3), (len(w), 1, 1)), -cross_matrices(points), points[:, :, None]], 2)
+    by_point = np.concatenate(
+        [tangent_basis(state.bearing) / w[:, None, None], -(state.bearing / w[:, None] ** 2)[:, :, None]], 2
+    )
+    weighted = weights[:, None, None] ** 2 * moved
+    normal = np.einsum("nig,nih->gh", weighted, moved)
+    measured = np.einsum("nij,nig->njg", by_point, weighted) @ np.linalg.inv(normal)
+    centers = -np.einsum("kji,kj->ki", state.rotation, state.translation)
+    motion = np.zeros((len(marginals.camera), 7))
+    pose = motion[: 6 * frames].reshape(frames, 6, 7)
+    pose[:, :3, 3:6] = state.rotation
+    pose[:, 3:, :3] = state.rotation
+    pose[:, 3:, 3:6] = -state.rotation @ cross_matrices(centers)
+    pose[:, 3:, 6] = -state.translation
+    return marginals.relative(motion, measured)[: 6 * frames, : 6 * frames]
+
+
+def tangent_basis(bearing: Array) -> Array:
+    """(n, 3, 2) orthonormal basis of the plane perpendicular to each unit vector."""
+    x, y, z = bearing.T
+    upright = np.abs(x) < 0.7  # the cross product by the x axis, or by the y axis
+    a, b, c = np.where(upright, 0.0, -z), np.where(upright, z, 0.0), np.where(upright, -y, x)
+    length = np.sqrt(a * a + b * b + c * c)
+    a, b, c = a / length, b / length, c / length
+    return np.stack([a, y * c - z * b, b, z * a - x * c, c, x * b - y * a], -1).reshape(-1, 3, 2)

@@ -1,0 +1,54 @@
+"""How large the errors of tracks are, and how far they repeat each other."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorsfm.adjustment.observations import Observations
+
+Array = NDArray[np.float64]
+
+FIRST_SIGMA_PX = 0.25  # of a tracked point, until it is measured
+SMALLEST_SIGMA_PX = 0.03  # no track is better than this
+_RAYLEIGH_MEDIAN = 1.1774  # median of the norm of a 2-D error, in standard deviations
+_BLOCKS = (8, 5, 16)  # across, down, frames: in which errors may be alike
+
+
+def typical_sigma(errors: Array) -> float:
+    """Standard deviation of a coordinate, from the lengths (n,) of 2-D errors with outliers."""
+    return float(np.median(errors)) / _RAYLEIGH_MEDIAN
+
+
+def coordinate_sigma(errors: Array) -> float:
+    """`typical_sigma`, but no better than tracks can be."""
+    return max(typical_sigma(errors), SMALLEST_SIGMA_PX)
+
+
+def block_inflation(residual: Array, observations: Observations) -> float:
+    """By how much errors of neighbouring tracks in neighbouring frames repeat each other: a factor on the variance.
+
+    In a block of the image and of time, independent errors add up to the root of their number.
+
+    Args:
+        residual: (m, 2) predicted minus observed position of each observation.
+    """
+    o, inlier = observations, _inliers(residual)
+    across, down, frames = _BLOCKS
+    key = (o.frame // frames) * down * across + image_cells(o.xy, across, down)
+    key, residual = key[inlier], residual[inlier]
+    sums = [np.bincount(key, residual[:, axis]) for axis in range(2)]
+    power = float((residual**2).sum())
+    return max(1.0, float((sums[0] ** 2 + sums[1] ** 2).sum()) / max(power, 1e-12))
+
+
+def image_cells(xy: Array, across: int, down: int) -> NDArray[np.int64]:
+    """(n,) cell of each position (n, 2) in a grid over what they fill, numbered row by row."""
+    low, high = xy.min(0), xy.max(0)
+    cell = (0.999 * (xy - low) / np.maximum(high - low, 1e-9) * [across, down]).astype(np.int64)
+    return np.asarray(cell[:, 1] * across + cell[:, 0])
+
+
+def _inliers(residual: Array) -> NDArray[np.bool_]:
+    size = np.linalg.norm(residual, axis=1)
+    return np.asarray(size < 3.0 * np.median(size))

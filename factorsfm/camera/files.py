@@ -1,0 +1,143 @@
+"""Camera files: JSON with the names and conventions of OpenCV or COLMAP."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from factorsfm.camera.projection import PIXEL_CENTER
+from factorsfm.support.errors import InputError
+
+# Focal length over the longer side: beyond, a unit has been mistaken. A lens of 2,000 mm on Super 35 film has 80.
+_FOCAL_RATIOS = (0.05, 200.0)
+
+
+def read_camera(path: str | Path) -> pycolmap.Camera:
+    """Read a camera from a JSON file.
+
+    The file holds ``width, height, fx, fy, cx, cy`` in pixels with centres at integers (a PINHOLE camera), or
+    ``width, height`` and ``model, params`` with the names and the order of COLMAP, principal point also with
+    centres at integers. Further keys are ignored.
+
+    Raises:
+        InputError: not readable, not JSON, a key missing, or a value that is no camera's.
+    """
+    path = Path(path)
+    try:
+        content = json.loads(path.read_text(encoding="utf-8-sig"))
+    except OSError as error:
+        raise InputError(f"camera file {path} cannot be read: {error.strerror}") from error
+    except ValueError as error:
+        raise InputError(f"camera file {path} is not JSON: {error}") from error
+    if not isinstance(content, dict):
+        raise InputError(f"camera file {path} holds a {type(content).__name__}; a JSON object is expected")
+    try:
+        return camera_from_json(content)
+    except InputError as error:
+        raise InputError(f"camera file {path}: {error}") from error
+
+
+def open_camera(camera: str | Path | pycolmap.Camera | None) -> pycolmap.Camera | None:
+    """The camera that a user means: itself, or that of a camera file.
+
+    Raises:
+        InputError: it is neither, or as in `read_camera`.
+    """
+    if isinstance(camera, str | Path):
+        return read_camera(camera)
+    if camera is not None and not isinstance(camera, pycolmap.Camera):
+        raise InputError(f"the camera is of type {type(camera).__name__}; a pycolmap.Camera or a file is expected")
+    return camera
+
+
+def camera_to_json(camera: pycolmap.Camera) -> dict[str, Any]:
+    """The content of a camera file, as `read_camera` reads it."""
+    return {
+        "width": camera.width,
+        "height": camera.height,
+        "fx": float(camera.focal_length_x),
+        "fy": float(camera.focal_length_y),
+        "cx": float(camera.principal_point_x) - PIXEL_CENTER,
+        "cy": float(camera.principal_point_y) - PIXEL_CENTER,
+        "model": camera.model_name,
+        "params": _shift_center(camera, -PIXEL_CENTER).tolist(),
+    }
+
+
+def check_camera(camera: pycolmap.Camera, width: int, height: int) -> None:
+    """Insist that the camera belongs to images of this size.
+
+    Raises:
+        InputError: it has another size.
+    """
+    if (camera.width, camera.height) != (width, height):
+        raise InputError(
+            f"the camera is made for {camera.width}x{camera.height} pixels, but the images have {width}x{height}"
+        )
+
+
+def camera_from_json(content: Mapping[str, Any]) -> pycolmap.Camera:
+    """A camera from the content of a camera file; errors as in `read_camera`."""
+    width, height = (_size(content, key) for key in ("width", "height"))
+    if ("model" in content) != ("params" in content):
+        raise InputError('"model" and "params" go together; one of them is missing')
+    if "model" in content:
+        model = content["model"]
+        params = _numbers(content["params"])
+    else:
+        model = "PINHOLE"
+        params = [_number(content, key) for key in ("fx", "fy", "cx", "cy")]
+    if not isinstance(model, str) or model not in set(pycolmap.CameraModelId.__members__) - {"INVALID"}:
+        raise InputError(f'"model" is {model!r}; the name of a COLMAP camera model is expected')
+    camera = pycolmap.Camera(
+        camera_id=1, model=model, width=width, height=height, params=params, has_prior_focal_length=True
+    )
+    if not camera.is_perspective():
+        raise InputError(f'"model" is {model}; a camera with a focal length is expected')
+    if not camera.verify_params():
+        raise InputError(f'"params" has {len(params)} numbers; {model} takes {camera.params_info}')
+    if any(params[i] <= 0 for i in camera.focal_length_idxs()):
+        raise InputError(f"the focal length in {params} is not positive")
+    low, high = (ratio * max(width, height) for ratio in _FOCAL_RATIOS)
+    for focal in (params[i] for i in camera.focal_length_idxs()):
+        if not low <= focal <= high:
+            raise InputError(
+                f"the focal length is {focal:g} pixels, of images of {width}x{height}; {low:g} to {high:g} is expected"
+            )
+    camera.params = _shift_center(camera, PIXEL_CENTER)
+    return camera
+
+
+def _shift_center(camera: pycolmap.Camera, shift: float) -> NDArray[np.float64]:
+    params = np.array(camera.params, dtype=np.float64)
+    params[camera.principal_point_idxs()] += shift
+    return params
+
+
+def _size(content: Mapping[str, Any], key: str) -> int:
+    value = _number(content, key)
+    if not 1 <= value <= 1_000_000 or value != int(value):
+        raise InputError(f'"{key}" is {value:g}; a positive whole number of pixels is expected')
+    return int(value)
+
+
+def _number(content: Mapping[str, Any], key: str) -> float:
+    if key not in content:
+        raise InputError(f'"{key}" is missing')
+    value = content[key]
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise InputError(f'"{key}" is {value!r}; a finite number is expected')
+    return float(value)
+
+
+def _numbers(values: Any) -> list[float]:
+    if not isinstance(values, list):
+        raise InputError(f'"params" is {values!r}; a list of numbers is expected')
+    return [_number({f"params[{i}]": value}, f"params[{i}]") for i, value in enumerate(values)]

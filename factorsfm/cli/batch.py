@@ -1,0 +1,198 @@
+"""``factorsfm batch``: the arguments, and what they do."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import shutil
+import time
+from collections.abc import Callable, Collection, Sequence
+from functools import partial
+from pathlib import Path
+
+from factorsfm.batch.crew import Crew, open_crew
+from factorsfm.batch.index import Entry, Index, shots_known
+from factorsfm.batch.plan import Job, Method, Video, find_videos, plan_jobs
+from factorsfm.batch.worker import Progress, find_shots_of, reconstruct_shot
+from factorsfm.camera.files import open_camera
+from factorsfm.priors.depth import open_depth
+from factorsfm.priors.masks import open_masks
+from factorsfm.report.result_folder import check_directory, is_earlier_result, write_failure
+from factorsfm.support.errors import FactorsfmError, InputError, ReconstructionError
+from factorsfm.support.json_text import json_text
+from factorsfm.support.options import Options
+from factorsfm.support.threads import available_cores
+
+Show = Callable[[str], None]
+
+logger = logging.getLogger(__name__)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments that only this command has."""
+    parser.add_argument(
+        "--workers",
+        type=_count,
+        metavar="N",
+        help="processes, each with a shot and its share of the cores (default: one for every core)",
+    )
+    parser.add_argument(
+        "--scheduler", metavar="ADDRESS", help="of a Dask cluster whose workers see the same files, as HOST:PORT"
+    )
+
+
+def run(arguments: argparse.Namespace, progress: Progress, show: Show) -> str:
+    """Reconstruct every shot, or go on where an earlier run has stopped.
+
+    Args:
+        progress: told the stages of a shot where this process does it itself; show: one line on the whole.
+
+    Returns:
+        Sentences for the user.
+
+    Raises:
+        InputError: the input cannot be used.
+        ReconstructionError: none of the shots could be reconstructed; the index says why.
+    """
+    if arguments.workers and arguments.scheduler:
+        raise InputError("--workers and --scheduler cannot be combined: a cluster has its own workers")
+    source, output = Path(arguments.source), arguments.output
+    videos = find_videos(source)
+    known = shots_known(output, source)
+    method = _method(arguments, several=source.is_dir())
+    most, scheduler = arguments.workers or len(available_cores()), arguments.scheduler
+    workers = min(most, len(videos))
+    with open_crew(workers, scheduler) as crew:
+        shots, unread = _find_shots(crew, videos, known, one_thread=_one_thread(workers, scheduler), show=show)
+    jobs = plan_jobs(shots, method, output, several=source.is_dir())
+    for job in jobs:
+        check_directory(job.folder)
+    _remove_others(output, jobs, unread)
+    index = Index(source, output, shots, unread, jobs)
+    waiting = [job for job in jobs if not job.is_done()]
+    for job in jobs:
+        if job not in waiting:
+            index.add(job)
+    index.write()
+    workers = max(1, min(most, len(waiting)))
+    with open_crew(workers, scheduler) as crew:
+        told = progress if workers == 1 and scheduler is None else None
+        work = partial(reconstruct_shot, one_thread=_one_thread(workers, scheduler), progress=told)
+        _reconstruct(crew, work, waiting, index, show)
+    return _conclusion(index.entries, unread, output)
+
+
+def _one_thread(workers: int, scheduler: str | None) -> bool:
+    """Whether each worker keeps to one thread: where it has no more than a core, others would only wait for it.
+
+    How many share a machine of a cluster is not known here.
+    """
+    return scheduler is not None or len(available_cores()) < 2 * workers
+
+
+def _method(arguments: argparse.Namespace, *, several: bool) -> Method:
+    """What was asked for, opened once so that a mistake is found before the work."""
+    depth, masks = _absolute(arguments.depth), _absolute(arguments.masks)
+    if Options.preset_named(arguments.preset).uses_depth and not (several and depth and Path(depth).is_dir()):
+        open_depth(depth, arguments.depth_kind)
+    if not (several and masks and Path(masks).is_dir()):
+        open_masks(masks)
+    camera = open_camera(arguments.camera)
+    return Method(camera, depth, arguments.depth_kind, masks, arguments.preset, arguments.lens, arguments.shutter)
+
+
+def _absolute(text: str | None) -> str | None:
+    """Workers may have another working directory; the word "none" is no value."""
+    if text is None or text == "none":
+        return None
+    return str(Path(text).resolve()) if Path(text).exists() else text
+
+
+def _find_shots(
+    crew: Crew, videos: Sequence[Video], known: dict[str, list[range]], *, one_thread: bool, show: Show
+) -> tuple[dict[Video, list[range]], dict[Video, str]]:
+    """Shots of the videos that can be read, and of the others why not.
+
+    Raises:
+        InputError: no video can be read.
+    """
+    found = {video: known[key] for video in videos if (key := json_text(video.to_dict())) in known}
+    unread: dict[Video, str] = {}
+    show(f"looking for cuts in {len(videos)} videos")
+    new = [video for video in videos if video not in found]
+    for done, (video, outcome) in enumerate(crew.run(partial(find_shots_of, one_thread=one_thread), new), 1):
+        show(f"looking for cuts: {done} of {len(new)} videos")
+        if isinstance(outcome, BaseException):
+            unread[video] = str(outcome)
+        else:
+            found[video] = outcome
+    if not found:
+        raise InputError(next(iter(unread.values())))
+    return {video: found[video] for video in videos if video in found}, unread
+
+
+def _reconstruct(crew: Crew, work: Callable[[Job], None], jobs: Sequence[Job], index: Index, show: Show) -> None:
+    """Do the jobs, the longest first, so that all workers end at about the same time."""
+    line = _Line(show, len(index.entries), jobs)
+    for job, outcome in crew.run(work, sorted(jobs, key=lambda job: -len(job.frames))):
+        if isinstance(outcome, BaseException):
+            logger.info("%s failed", job.folder, exc_info=outcome)
+            said = str(outcome) if isinstance(outcome, FactorsfmError) else f"{type(outcome).__name__}: {outcome}"
+            # Without the job beside it, so that the next run tries again.
+            write_failure(job.folder, said, options={"source": str(job.video.path)})
+        index.add(job)
+        index.write()
+        line.tell(job)
+
+
+def _remove_others(output: Path, jobs: Sequence[Job], unread: Collection[Video]) -> None:
+    """Remove results that an earlier run left and that are none of these jobs: of a video that had more shots.
+
+    Those of a video that cannot be read now stay.
+    """
+    kept = {job.folder for job in jobs}
+    unreadable = {video.name for video in unread}
+    for folder in output.absolute().glob("*/shot_*"):
+        if folder not in kept and folder.parent.name not in unreadable and is_earlier_result(folder):
+            logger.info("%s is removed: the video has no such shot any more", folder)
+            shutil.rmtree(folder)
+
+
+class _Line:
+    """How far it is, and how long it will take."""
+
+    def __init__(self, show: Show, done: int, waiting: Sequence[Job]) -> None:
+        self._show, self._shots, self._done = show, done + len(waiting), done
+        self._frames, self._frames_done = sum(len(job.frames) for job in waiting), 0
+        self._begin = time.monotonic()
+        show(f"shot {self._done} of {self._shots}")
+
+    def tell(self, job: Job) -> None:
+        self._done += 1
+        self._frames_done += len(job.frames)
+        left = (time.monotonic() - self._begin) * (self._frames / self._frames_done - 1.0)
+        self._show(f"{self._done} of {self._shots} shots done, {_remaining(left)} left")
+
+
+def _remaining(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}"
+
+
+def _conclusion(entries: Sequence[Entry], unread: dict[Video, str], output: Path) -> str:
+    lines = [
+        f"{entry.folder}, frames {entry.frames[0]} to {entry.frames[1] - 1}: "
+        f"{'' if entry.reconstructed else 'not reconstructed: '}{entry.verdict}."
+        for entry in entries
+    ]
+    lines += [f"{video.path.name}: {reason}." for video, reason in unread.items()]
+    if not any(entry.reconstructed for entry in entries):
+        raise ReconstructionError(f"none of {len(entries)} shots could be reconstructed; {lines[0]}")
+    return "\n".join([*lines, f"Results in {output}; open {output / 'index.html'}"])
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f'"{text}" is no number of processes')
+    return int(text)

@@ -1,0 +1,81 @@
+"""The demonstration: render a shot, reconstruct it from its video file, compare with the truth."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from factorsfm import api
+from factorsfm.camera.files import read_camera
+from factorsfm.evaluation.metrics import TrajectoryErrors, trajectory_errors
+from factorsfm.report.picture import draw_picture
+from factorsfm.report.result_folder import check_directory, write_folder
+from factorsfm.result.reconstruction import Reconstruction
+from factorsfm.support.errors import InputError
+from factorsfm.support.similarity import pose_arrays
+from factorsfm.synthetic import render_shot, write_shot
+
+
+@dataclass(frozen=True, slots=True)
+class DemoResult:
+    """A reconstruction beside the truth.
+
+    Attributes:
+        reconstruction: of the rendered shot.
+        errors: of its camera path after similarity alignment, units of the truth and degrees.
+        path_length: of the true camera path, units of the truth.
+    """
+
+    reconstruction: Reconstruction
+    errors: TrajectoryErrors
+    path_length: float
+
+    def comparison(self) -> str:
+        """The errors in words."""
+        position, step = (100 * float(np.median(e)) / self.path_length for e in (self.errors.ate, self.errors.t_rpe))
+        return (
+            "Against the truth, after similarity alignment (medians): "
+            f"camera position {position:.2f} % of the path's length; "
+            f"from frame to frame {step:.2f} % and {float(np.median(self.errors.r_rpe)):.4f} degrees."
+        )
+
+
+def run_demo(directory: str | Path, progress: Callable[[str, int, int | None], None] | None = None) -> DemoResult:
+    """Render, reconstruct and compare; writes the result folder and picture.png into it.
+
+    Args:
+        directory: of the result: new, empty, or holding an earlier result, which is replaced.
+        progress: called with stage, done and total.
+
+    Raises:
+        InputError: the directory cannot be written.
+        ReconstructionError: the shot cannot be reconstructed.
+    """
+    check_directory(directory)
+    if progress is not None:
+        progress("rendering", 0, None)
+    shot = render_shot()
+    with tempfile.TemporaryDirectory(prefix="factorsfm-demo-") as temporary:
+        folder = Path(temporary)
+        write_shot(shot, folder)
+        reconstruction = api.reconstruct(
+            folder / "shot.mp4",
+            camera=read_camera(folder / "camera.json"),
+            depth=folder / "depth",
+            depth_kind="inverse",
+            progress=progress,
+        )
+    truth = pose_arrays(shot.cam_from_world)
+    estimate = pose_arrays([frame.cam_from_world for frame in reconstruction.frames])
+    errors = trajectory_errors(*estimate, *truth)
+    path_length = float(np.linalg.norm(np.diff(truth[1], axis=0), axis=1).sum())
+    reconstruction.options["source"] = "rendered shot"  # its file is gone
+    write_folder(reconstruction, directory)
+    if not cv2.imwrite(str(Path(directory) / "picture.png"), draw_picture(reconstruction)):
+        raise InputError(f"cannot write the picture into {directory}")
+    return DemoResult(reconstruction, errors, path_length)

@@ -1,0 +1,54 @@
+"""``factorsfm export``: the arguments, and what they do."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import fields
+from pathlib import Path
+
+from factorsfm.export.formats import FORMATS, export
+from factorsfm.export.options import ExportOptions, UpAxis
+from factorsfm.result.reading import read_result
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
+    parser.add_argument("result", type=Path, metavar="RESULT", help="folder that factorsfm reconstruct has written")
+    parser.add_argument("--format", required=True, choices=list(FORMATS), metavar="NAME", help=_formats_help())
+    parser.add_argument(
+        "--output", type=Path, required=True, metavar="PATH", help="the file, or for some formats the folder, to write"
+    )
+    parser.add_argument("--fps", type=float, help="frames per second (default: the source's, else 24)")
+    parser.add_argument(
+        "--first-frame", type=int, metavar="NUMBER", help="number of the source's first frame (default: the format's)"
+    )
+    parser.add_argument(
+        "--sensor-width", type=float, default=36.0, metavar="MM", help="of the film back (default: %(default)g)"
+    )
+    parser.add_argument(
+        "--up-axis", choices=[axis.value for axis in UpAxis], help="in the first frame (default: the format's)"
+    )
+    parser.add_argument("--scale", type=float, help="exported length of one unit (default: the format's)")
+    parser.add_argument("--footage", type=Path, metavar="VIDEO|FOLDER", help="the shot (default: the source)")
+
+
+def run(arguments: argparse.Namespace) -> str:
+    """Write the export.
+
+    Returns:
+        A sentence for the user.
+
+    Raises:
+        InputError: nothing has been written.
+    """
+    given = {field.name: getattr(arguments, field.name) for field in fields(ExportOptions)}
+    options = ExportOptions(**given)
+    reconstruction = read_result(arguments.result)
+    export(reconstruction, arguments.output, format=arguments.format, options=options)
+    lost = len(reconstruction.frames) - len(reconstruction.registered)
+    without = f"; {lost} of {len(reconstruction.frames)} frames are not registered and have no camera" if lost else ""
+    return f"Wrote {arguments.format} ({FORMATS[arguments.format].description}) to {arguments.output}{without}."
+
+
+def _formats_help() -> str:
+    return "; ".join(f"{name}: {format.description}" for name, format in FORMATS.items())

@@ -1,0 +1,41 @@
+"""``factorsfm overlay``: the arguments, and what they do."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+
+from factorsfm.report.overlay import CODECS, LAYERS, write_overlay
+from factorsfm.result.reading import read_result
+
+_PLANES = {
+    "ground": "the ground that {n} points lie on",
+    "plane": "the plane that {n} points lie on",
+    "distance": "a plane at the median distance, since too few points lie on one",
+}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
+    parser.add_argument("result", type=Path, metavar="RESULT", help="folder that factorsfm reconstruct has written")
+    parser.add_argument(
+        "--output", type=Path, required=True, metavar="FILE", help=f"the video to write ({', '.join(CODECS)})"
+    )
+    parser.add_argument("--source", type=Path, metavar="VIDEO|FOLDER", help="the shot (default: where it was)")
+    parser.add_argument("--hide", nargs="+", choices=LAYERS, default=[], help="what not to draw")
+
+
+def run(arguments: argparse.Namespace, progress: Callable[[str, int, int | None], None]) -> str:
+    """Write the overlay.
+
+    Returns:
+        A sentence for the user.
+
+    Raises:
+        InputError: nothing has been written.
+    """
+    reconstruction = read_result(arguments.result)
+    props = write_overlay(reconstruction, arguments.output, arguments.source, hide=arguments.hide, progress=progress)
+    plane = _PLANES[props.plane.kind].format(n=len(props.plane.support))
+    return f"Wrote {arguments.output}: the grid is on {plane}; a cell is {props.cell:g} wide."

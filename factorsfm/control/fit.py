@@ -1,0 +1,49 @@
+"""What control did to a result."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    pass
+
+
+@dataclass(frozen=True, slots=True)
+class ControlResidual:
+    """How far one item of the control is from the result.
+
+    Attributes:
+        name: of the item; unit: of `error` and `sigma`: "m", "degrees" or "px".
+        error: length of the difference; sigma: as given; sigmas: the one over the other.
+        contradicts: whether the difference is so large that the item was given next to no weight.
+    """
+
+    name: str
+    unit: str
+    error: float
+    sigma: float
+    sigmas: float
+    contradicts: bool
+
+
+@dataclass(frozen=True, slots=True)
+class ControlFit:
+    """What the control did.
+
+    Attributes:
+        residuals: of every item that was used.
+        held: names of the frames whose poses were held exactly.
+        unused: what could not be used, and why.
+        placed: whether the result is in the world of the control; where only distances or heights are known, it is in
+            that of its first camera.
+        scale_std: relative standard deviation of the scene's size in the control's unit.
+        position_std: standard deviation of a camera's position in this world and unit, median over the cameras.
+    """
+
+    residuals: list[ControlResidual]
+    held: list[str]
+    unused: list[str]
+    placed: bool
+    scale_std: float
+    position_std: float

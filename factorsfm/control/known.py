@@ -1,0 +1,342 @@
+"""Control: what is known of a scene beforehand, in a world of its own: poses, points, distances, heights.
+
+Positions and lengths are in the unit of that world, which the result takes over and calls metres. Every value comes
+with its standard deviation (`sigma`). Frames are named by their name, with or without suffix, or by their index.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path, PurePath
+from typing import Any, Protocol
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from factorsfm.adjustment.observations import Observations
+from factorsfm.control.world_alignment import check_enough
+from factorsfm.support.errors import InputError
+
+Array = NDArray[np.float64]
+Vector = Sequence[float] | Array
+FrameKey = str | int
+
+_KINDS = ("poses", "points", "distances", "heights")
+
+
+@dataclass(frozen=True, slots=True)
+class KnownPose:
+    """Where a camera is, and how it is turned if that is known, too.
+
+    Attributes:
+        frame: name or index.
+        position: (3,) centre of the camera; sigma: of each coordinate. 0 holds the whole pose exactly.
+        cam_from_world: (4,) quaternion x, y, z, w of the rotation from the world to the camera, or None.
+        rotation_sigma: of the rotation about each axis, degrees. 0 holds the whole pose exactly.
+
+    Raises:
+        InputError: a value is missing or is none, or one of two sigmas is 0.
+    """
+
+    frame: FrameKey
+    position: Vector | None = None
+    sigma: float | None = None
+    cam_from_world: Vector | None = None
+    rotation_sigma: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.position is None and self.cam_from_world is None:
+            raise InputError('neither "position" nor "cam_from_world" is given')
+        _check_vector("position", self.position, 3)
+        _check_vector("cam_from_world", self.cam_from_world, 4)
+        if self.cam_from_world is not None and abs(float(np.linalg.norm(self.cam_from_world)) - 1.0) > 1e-3:
+            raise InputError(f'"cam_from_world" is {list(self.cam_from_world)}; a unit quaternion is expected')
+        _check_sigma("sigma", self.sigma, self.position is not None, zero=True)
+        _check_sigma("rotation_sigma", self.rotation_sigma, self.cam_from_world is not None, zero=True)
+        if 0.0 in (self.sigma, self.rotation_sigma) and self.sigma != self.rotation_sigma:
+            raise InputError(
+                f'"sigma" is {self.sigma} and "rotation_sigma" {self.rotation_sigma}; '
+                "a pose that is held exactly needs a position and a rotation with 0 for both"
+            )
+
+    @classmethod
+    def at(
+        cls, frame: FrameKey, cam_from_world: pycolmap.Rigid3d, sigma: float = 0.0, rotation_sigma: float = 0.0
+    ) -> KnownPose:
+        """A pose as a result has it; it is held exactly unless sigmas are given."""
+        center = np.asarray(cam_from_world.inverse().translation, np.float64)
+        return cls(frame, center, sigma, np.asarray(cam_from_world.rotation.quat, np.float64), rotation_sigma)
+
+    @property
+    def held(self) -> bool:
+        """Whether the pose is exact."""
+        return self.sigma == 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class MarkedPoint:
+    """A point that was marked in images by hand, and its position if that is known.
+
+    Attributes:
+        name: by which distances and heights refer to it.
+        pixels: where frames see it, pixels of the image with centres at integers; one frame at least, two where the
+            position is unknown.
+        pixel_sigma: of each coordinate of a mark, pixels.
+        position: (3,) or None; sigma: of each coordinate.
+
+    Raises:
+        InputError: a value is missing or is none.
+    """
+
+    name: str
+    pixels: Mapping[FrameKey, Vector]
+    pixel_sigma: float = 1.0
+    position: Vector | None = None
+    sigma: float | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.pixels, Mapping):
+            raise InputError(f'"pixels" is {self.pixels!r}; frames with their [x, y] are expected')
+        needed = 1 if self.position is not None else 2
+        if len(self.pixels) < needed:
+            raise InputError(f'"{self.name}" is marked in {len(self.pixels)} of {needed} needed frames')
+        for frame, xy in self.pixels.items():
+            _check_vector(f"pixels of {frame}", xy, 2)
+        _check_vector("position", self.position, 3)
+        _check_sigma("pixel_sigma", self.pixel_sigma, True)
+        _check_sigma("sigma", self.sigma, self.position is not None)
+
+
+@dataclass(frozen=True, slots=True)
+class KnownDistance:
+    """The distance between two cameras, two marked points, or a camera and a marked point.
+
+    Attributes:
+        length, sigma: the distance.
+        frames, points: the two ends.
+
+    Raises:
+        InputError: a value is missing or is none.
+    """
+
+    length: float
+    sigma: float
+    frames: Sequence[FrameKey] = ()
+    points: Sequence[str] = ()
+
+    def __post_init__(self) -> None:
+        _check_sigma("length", self.length, True)
+        _check_sigma("sigma", self.sigma, True)
+        if len(self.frames) + len(self.points) != 2 or len({*self.frames}) + len({*self.points}) != 2:
+            raise InputError(
+                f'"frames" is {list(self.frames)} and "points" {list(self.points)}; two different ends are expected'
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class KnownHeight:
+    """The height of a camera above the plane through three marked points, on the ground or elsewhere.
+
+    Attributes:
+        frame: the camera.
+        above: names of three points that are not on a line.
+        length, sigma: the height, a positive number on whichever side the camera is.
+
+    Raises:
+        InputError: a value is missing or is none.
+    """
+
+    frame: FrameKey
+    above: Sequence[str]
+    length: float
+    sigma: float
+
+    def __post_init__(self) -> None:
+        _check_sigma("length", self.length, True)
+        _check_sigma("sigma", self.sigma, True)
+        if len({*self.above}) != 3 or len(self.above) != 3:
+            raise InputError(f'"above" is {list(self.above)}; the names of three points are expected')
+
+
+@dataclass(frozen=True, slots=True)
+class Control:
+    """Everything that is known beforehand.
+
+    Raises:
+        InputError: nothing is known, a frame or a point is there twice, a point that is not there is referred to, or
+            what is known leaves open where the scene is in the control's world.
+    """
+
+    poses: Sequence[KnownPose] = ()
+    points: Sequence[MarkedPoint] = ()
+    distances: Sequence[KnownDistance] = ()
+    heights: Sequence[KnownHeight] = ()
+
+    def __post_init__(self) -> None:
+        names = [point.name for point in self.points]
+        for what, keys in (("frame", [str(pose.frame) for pose in self.poses]), ("point", names)):
+            twice = [key for key in keys if keys.count(key) > 1]
+            if twice:
+                raise InputError(f'{what} "{twice[0]}" is there twice')
+        for name in (*(n for d in self.distances for n in d.points), *(n for h in self.heights for n in h.above)):
+            if name not in names:
+                raise InputError(f'point "{name}" is not among the marked points')
+        known = any(point.position is not None for point in self.points)
+        if not (self.poses or known or self.distances or self.heights):
+            raise InputError("it holds no known pose, point, distance or height")
+        if self.poses or known:
+            self._check_enough()
+
+    def _check_enough(self) -> None:
+        """As far as that can be said without the images."""
+        known = [(pose.position, pose.sigma) for pose in self.poses]
+        known += [(point.position, point.sigma) for point in self.points if len(point.pixels) > 1]
+        given = [(position, sigma) for position, sigma in known if position is not None]
+        check_enough(
+            np.array([position for position, _ in given], np.float64).reshape(-1, 3),
+            np.array([sigma for _, sigma in given], np.float64),
+            any(pose.cam_from_world is not None for pose in self.poses),
+            bool(self.distances or self.heights),
+        )
+
+    @property
+    def frames(self) -> list[FrameKey]:
+        """All frames that are referred to, each once."""
+        marked = [frame for point in self.points for frame in point.pixels]
+        ends = [frame for distance in self.distances for frame in distance.frames]
+        every = [*marked, *ends, *(height.frame for height in self.heights), *(pose.frame for pose in self.poses)]
+        return list(dict.fromkeys(every))
+
+
+class NamedFrame(Protocol):
+    """What is needed to find a frame."""
+
+    @property
+    def index(self) -> int: ...
+    @property
+    def name(self) -> str: ...
+
+
+@dataclass(frozen=True, slots=True)
+class LocatedControl:
+    """Control with its frames found in a shot or a set.
+
+    Attributes:
+        position: of each frame among those of the source.
+        names: of the frames, by position.
+        marks: of the points (rows of `Control.points`) in the frames (positions).
+    """
+
+    control: Control
+    position: dict[FrameKey, int]
+    names: list[str]
+    marks: Observations
+
+
+def find_frames(control: Control, frames: Sequence[tuple[int, str]]) -> dict[FrameKey, int]:
+    """Position of each frame of the control among those with these indices and names.
+
+    Raises:
+        InputError: a frame is not there.
+    """
+    by_name: dict[FrameKey, int] = {}
+    for position, (index, _) in enumerate(frames):
+        by_name.update({index: position, str(index): position})
+    by_name.update({PurePath(name).stem: position for position, (_, name) in enumerate(frames)})
+    by_name.update({name: position for position, (_, name) in enumerate(frames)})
+    missing = [key for key in control.frames if key not in by_name]
+    if missing:
+        raise InputError(f"control: there is no frame {missing[0]!r} among the {len(frames)} frames")
+    return {key: by_name[key] for key in control.frames}
+
+
+def locate(control: Control, frames: Sequence[NamedFrame], normalized: Callable[[int, Array], Array]) -> LocatedControl:
+    """Find the frames of the control in a source.
+
+    Args:
+        normalized: gives the undistorted normalised coordinates (n, 2) of pixels (n, 2) in the frame at a position.
+
+    Raises:
+        InputError: a frame is not there, or a mark is where the lens has no inverse.
+    """
+    found = find_frames(control, [(frame.index, frame.name) for frame in frames])
+    marks: list[tuple[int, int, Array]] = []
+    for row, point in enumerate(control.points):
+        for key, xy in point.pixels.items():
+            uv = normalized(found[key], np.asarray(xy, np.float64)[None])[0]
+            if not np.isfinite(uv).all():
+                raise InputError(f"control: point {point.name} at {list(xy)} in frame {key!r} is outside of the lens")
+            marks.append((found[key], row, uv))
+    seen = Observations(
+        np.array([mark[0] for mark in marks], np.int64),
+        np.array([mark[1] for mark in marks], np.int64),
+        np.array([mark[2] for mark in marks]).reshape(-1, 2),
+    )
+    return LocatedControl(control, found, [frame.name for frame in frames], seen)
+
+
+def read_control(path: str | Path) -> Control:
+    """Read control from a JSON file: lists "poses", "points", "distances" and "heights" of objects.
+
+    The keys of the objects are the attributes of `KnownPose`, `MarkedPoint`, `KnownDistance` and `KnownHeight`.
+
+    Raises:
+        InputError: not readable, not JSON, an unknown key, or a value that is none.
+    """
+    path = Path(path)
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"control file {path} cannot be read: {error.strerror}") from error
+    except ValueError as error:
+        raise InputError(f"control file {path} is not JSON: {error}") from error
+    try:
+        if not isinstance(content, dict) or not set(content) <= set(_KINDS):
+            given = ", ".join(content) if isinstance(content, dict) else type(content).__name__
+            raise InputError(f"it holds {given}; an object with {', '.join(_KINDS)} is expected")
+        kinds: tuple[type, ...] = (KnownPose, MarkedPoint, KnownDistance, KnownHeight)
+        parts = {name: _items(content.get(name, []), name, kind) for name, kind in zip(_KINDS, kinds, strict=True)}
+        return Control(**parts)
+    except InputError as error:
+        raise InputError(f"control file {path}: {error}") from error
+
+
+def _items(values: Any, name: str, kind: type) -> list[Any]:
+    if not isinstance(values, list):
+        raise InputError(f'"{name}" is a {type(values).__name__}; a list is expected')
+    known = [f.name for f in fields(kind)]
+    items = []
+    for i, value in enumerate(values):
+        try:
+            if not isinstance(value, dict) or not set(value) <= set(known):
+                raise InputError(f"it is {value!r}; an object with {', '.join(known)} is expected")
+            items.append(kind(**value))
+        except InputError as error:
+            raise InputError(f"{name}[{i}]: {error}") from error
+        except TypeError as error:  # a key is missing
+            missing = str(error).rpartition(": ")[2].replace("'", '"')
+            raise InputError(f"{name}[{i}]: {missing} is missing") from error
+    return items
+
+
+def _check_vector(name: str, value: Any, length: int) -> None:
+    if value is None:
+        return
+    good = isinstance(value, Sequence | np.ndarray) and not isinstance(value, str) and len(value) == length
+    if not good or not all(_is_number(v) for v in value):
+        raise InputError(f'"{name}" is {value!r}; {length} finite numbers are expected')
+
+
+def _check_sigma(name: str, value: Any, needed: bool, *, zero: bool = False) -> None:
+    if value is None and needed:
+        raise InputError(f'"{name}" is missing')
+    if value is not None and (not _is_number(value) or value < 0 or (value == 0 and not zero)):
+        raise InputError(f'"{name}" is {value!r}; a positive number{" or 0" if zero else ""} is expected')
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float | np.number) and not isinstance(value, bool) and math.isfinite(value)

@@ -1,0 +1,254 @@
+"""Control as a term of the polish: its residuals with their derivatives, on poses, marked points and the datum.
+
+The polish stays in the world of its first camera. The datum takes a position ``x`` of that to the world of the control,
+``y = s R (x - a) + T``. Its seven variables and the positions of the marked points are `State.control` and the last
+columns of the camera side: a rotation vector (applied after the start of R), T, log s, then three for each point.
+
+Every residual is in standard deviations. Pose derivatives use the convention of `factors`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from factorsfm.adjustment.residuals import by_pose, camera_points, cauchy, reprojection
+from factorsfm.adjustment.state import State
+from factorsfm.support.rotations import cross_matrices
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+DATUM = 7  # variables of the datum
+
+# Residual (d,), the columns that it depends on (c,), and its derivative by these (d, c).
+Linearized = tuple[Array, Index, Array]
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A camera (row of the frame), or a marked point (row of the point)."""
+
+    row: int
+    camera: bool = False
+
+
+class View:
+    """A state as the residuals see it.
+
+    Args:
+        start: (3, 3) rotation of the datum before `State.control` turns it; anchor: (3,) the position ``a``.
+        first: column of the first variable of the control.
+    """
+
+    def __init__(self, state: State, start: Array, anchor: Array, first: int = 0) -> None:
+        self.state = state
+        self.first = first
+        turn, by_vector = cv2.Rodrigues(state.control[:3])
+        self.rotation = turn @ start
+        self.by_vector = np.asarray(by_vector).reshape(3, 3, 3) @ start  # of the rotation, by the rotation vector
+        self.shift, self.scale = state.control[3:6], float(np.exp(state.control[6]))
+        self.anchor = anchor
+
+    def place(self, place: Place) -> Linearized:
+        """Position in the world of the polish."""
+        if place.camera:
+            rotation, translation = self.state.rotation[place.row], self.state.translation[place.row]
+            return -rotation.T @ translation, 6 * place.row + np.arange(3, 6), rotation.T
+        offset = DATUM + 3 * place.row
+        return self.state.control[offset : offset + 3], self.first + offset + np.arange(3), np.eye(3)
+
+    def known_place(self, place: Place) -> Linearized:
+        """Position in the world of the control, by the place and by the datum."""
+        x, columns, by_place = self.place(place)
+        away = self.rotation @ (x - self.anchor)
+        by_turn = self.scale * (self.by_vector @ (x - self.anchor)).T
+        by_datum = np.concatenate([by_turn, np.eye(3), self.scale * away[:, None]], 1)
+        derivative = np.concatenate([self.scale * self.rotation @ by_place, by_datum], 1)
+        return self.scale * away + self.shift, np.append(columns, self.first + np.arange(DATUM)), derivative
+
+    @property
+    def own_turn(self) -> Array:
+        """(3, 3) small rotation of the datum on its right (as of a pose, in `factors`), by its rotation vector."""
+        skew = self.rotation.T @ self.by_vector
+        return np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]])
+
+    @property
+    def scale_column(self) -> int:
+        return self.first + 6
+
+
+class Item(Protocol):
+    """Something that is known.
+
+    Attributes:
+        name: for people; unit: of its error ("m", "degrees", "px"), `sigma` in the same unit.
+    """
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def unit(self) -> str: ...
+    @property
+    def sigma(self) -> float: ...
+    def linearized(self, view: View) -> Linearized: ...
+
+
+@dataclass(frozen=True, slots=True)
+class PositionItem:
+    """``(y - known) / sigma`` of a camera or a marked point."""
+
+    name: str
+    place: Place
+    known: Array
+    sigma: float
+    unit: str = "m"
+
+    def linearized(self, view: View) -> Linearized:
+        y, columns, derivative = view.known_place(self.place)
+        return (y - self.known) / self.sigma, columns, derivative / self.sigma
+
+
+@dataclass(frozen=True, slots=True)
+class RotationItem:
+    """Rotation vector of ``G W`` over sigma: G the known cam_from_world, W the camera's world_from_cam beside it."""
+
+    name: str
+    row: int
+    known: Array
+    sigma: float  # degrees
+    unit: str = "degrees"
+
+    def linearized(self, view: View) -> Linearized:
+        world_from_cam = view.state.rotation[self.row].T
+        off = self.known @ view.rotation @ world_from_cam
+        vector = cv2.Rodrigues(off)[0][:, 0]
+        by_camera = np.concatenate([np.eye(3), view.state.rotation[self.row] @ view.own_turn], 1)
+        derivative = _inverse_right_jacobian(vector) @ by_camera
+        columns = np.append(6 * self.row + np.arange(3), view.first + np.arange(3))
+        sigma = np.radians(self.sigma)
+        return vector / sigma, columns, derivative / sigma
+
+
+@dataclass(frozen=True, slots=True)
+class MarkItem:
+    """``(f q_xy / q_z - observed) / sigma`` of a marked point in a frame."""
+
+    name: str
+    row: int
+    point: Place
+    observed: Array  # (2,) normalised
+    sigma: float  # pixels
+    unit: str = "px"
+
+    def linearized(self, view: View) -> Linearized:
+        s, focal, one = view.state, float(view.state.focal[self.row]), np.ones(1)
+        x, columns, _ = view.place(self.point)
+        q = camera_points(s.rotation[self.row], s.translation[self.row], x[None], one)
+        q[:, 2] = np.maximum(q[:, 2], 1e-6)
+        residual, by_q = reprojection(q, focal * self.observed[None], focal)
+        by_camera = by_pose(by_q[0], q.repeat(2, 0), one.repeat(2))
+        derivative = np.concatenate([by_camera, by_q[0] @ s.rotation[self.row]], 1)
+        return residual[0] / self.sigma, np.append(6 * self.row + np.arange(6), columns), derivative / self.sigma
+
+
+@dataclass(frozen=True, slots=True)
+class DistanceItem:
+    """``(s |x_1 - x_2| - known) / sigma`` between two places."""
+
+    name: str
+    ends: tuple[Place, Place]
+    known: float
+    sigma: float
+    unit: str = "m"
+
+    def linearized(self, view: View) -> Linearized:
+        (a, a_columns, by_a), (b, b_columns, by_b) = (view.place(end) for end in self.ends)
+        length = float(np.linalg.norm(a - b))
+        along = view.scale * (a - b) / max(length, 1e-12)
+        derivative = np.concatenate([along @ by_a, -along @ by_b, [view.scale * length]])[None]
+        columns = np.concatenate([a_columns, b_columns, [view.scale_column]])
+        return np.array([view.scale * length - self.known]) / self.sigma, columns, derivative / self.sigma
+
+
+@dataclass(frozen=True, slots=True)
+class HeightItem:
+    """``(s |n (c - x)| - known) / sigma`` of a camera c above the plane with the unit normal n through three points."""
+
+    name: str
+    row: int
+    points: tuple[Place, Place, Place]
+    known: float
+    sigma: float
+    unit: str = "m"
+
+    def linearized(self, view: View) -> Linearized:
+        center, columns, by_center = view.place(Place(self.row, camera=True))
+        base, first, second = (view.place(point)[0] for point in self.points)
+        a, b, e = first - base, second - base, center - base
+        normal = np.cross(a, b)
+        size = max(float(np.linalg.norm(normal)), 1e-12)
+        normal = normal / size
+        height = float(normal @ e)
+        side = view.scale * (1.0 if height >= 0.0 else -1.0)
+        beside = (e - height * normal) / size
+        by_e, by_a, by_b = side * normal, side * np.cross(b, beside), side * np.cross(beside, a)
+        derivative = np.concatenate([by_e @ by_center, -(by_a + by_b + by_e), by_a, by_b, [side * height]])[None]
+        columns = np.concatenate([columns, *(view.place(point)[1] for point in self.points), [view.scale_column]])
+        return np.array([side * height - self.known]) / self.sigma, columns, derivative / self.sigma
+
+
+class ControlTerm:
+    """All control as a term of `BundleAdjustment`, with a Cauchy kernel on every item.
+
+    Args:
+        start: (3, 3) rotation of the datum; anchor: (3,) its place in the world of the polish, see `View`.
+        free: (7 + 3 p,) which variables of the datum and of the marked points are estimated.
+        kernel: scale of the Cauchy kernel, standard deviations.
+    """
+
+    def __init__(
+        self,
+        items: Sequence[Item],
+        start: Array,
+        anchor: Array,
+        free: NDArray[np.bool_],
+        kernel: float,
+    ) -> None:
+        self.items, self.kernel = items, kernel
+        self.free = free
+        self._start, self._anchor = start, anchor
+
+    def view(self, state: State, first: int = 0) -> View:
+        return View(state, self._start, self._anchor, first)
+
+    def residuals(self, state: State) -> list[Array]:
+        """Of every item, in standard deviations."""
+        view = self.view(state)
+        return [item.linearized(view)[0] for item in self.items]
+
+    def cost(self, state: State) -> float:
+        """Robust cost."""
+        return sum(float(cauchy(r[None], self.kernel)[0][0]) for r in self.residuals(state))
+
+    def add(self, state: State, information: Array, gradient: Array, first: int) -> None:
+        """Add to the normal equations (c, c) and (c,) of a camera side whose control begins at the column `first`."""
+        view = self.view(state, first)
+        for item in self.items:
+            residual, columns, derivative = item.linearized(view)
+            weight = cauchy(residual[None], self.kernel)[1][0]
+            information[np.ix_(columns, columns)] += weight * derivative.T @ derivative
+            gradient[columns] += weight * derivative.T @ residual
+
+
+def _inverse_right_jacobian(vector: Array) -> Array:
+    """(3, 3) change of a rotation vector by a small rotation on the right (Forster et al., T-RO 2017, equation 9)."""
+    angle = float(np.linalg.norm(vector))
+    hat = cross_matrices(vector[None])[0]
+    bend = 1.0 / 12.0 if angle < 1e-3 else 1.0 / angle**2 - (1.0 + np.cos(angle)) / (2.0 * angle * np.sin(angle))
+    return np.asarray(np.eye(3) + 0.5 * hat + bend * hat @ hat)

@@ -1,0 +1,64 @@
+"""A frame: an image with its place in the source."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorsfm.support.errors import InputError
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """One image of a shot.
+
+    Attributes:
+        index: position in the source, counted from 0 before any range or step is applied.
+        image: (h, w, 3) uint8, BGR.
+        name: file name, or the zero-padded index for videos and iterables.
+        timestamp: seconds from the start of the video, None where unknown.
+        dropped: frames of a live source that were skipped right before this one, because nobody was ready for them.
+        path: the image file, whose EXIF data may tell the lens; None where there is none.
+    """
+
+    index: int
+    image: NDArray[np.uint8]
+    name: str
+    timestamp: float | None = None
+    dropped: int = 0
+    path: Path | None = None
+
+
+def bgr_image(image: object, index: int) -> NDArray[np.uint8]:
+    """(h, w, 3) uint8 from a grey, BGR or BGRA image of 8 or 16 bits.
+
+    Args:
+        index: of the frame, for the message.
+
+    Raises:
+        InputError: it is no such image.
+    """
+    if not isinstance(image, np.ndarray) or image.dtype not in (np.uint8, np.uint16):
+        found = f"an array of {image.dtype}" if isinstance(image, np.ndarray) else f"of type {type(image).__name__}"
+        raise InputError(f"frame {index} is {found}; an array of uint8 or uint16 is expected")
+    channels = image.shape[2] if image.ndim == 3 else 1
+    if image.ndim not in (2, 3) or channels not in (1, 3, 4) or image.size == 0:
+        raise InputError(f"frame {index} has shape {image.shape}; (h, w), (h, w, 3) or (h, w, 4) is expected")
+    depth8 = image if image.dtype == np.uint8 else (image >> 8).astype(np.uint8)
+    if channels == 1:
+        return np.repeat(depth8.reshape(*depth8.shape[:2], 1), 3, axis=2)
+    return np.ascontiguousarray(depth8[:, :, :3])
+
+
+def as_frame(frame: Frame | NDArray[np.uint8], index: int) -> Frame:
+    """A frame with a BGR image; an image alone becomes the frame number `index`.
+
+    Raises:
+        InputError: it is no image.
+    """
+    if not isinstance(frame, Frame):
+        frame = Frame(index, frame, f"{index:06d}", None)
+    return replace(frame, image=bgr_image(frame.image, frame.index))

@@ -1,0 +1,47 @@
+"""Ranges of frames, as users write them."""
+
+from __future__ import annotations
+
+import re
+
+from factorsfm.support.errors import InputError
+
+_RANGE = re.compile(r"(\d*):(\d*)(?::(\d+))?", re.ASCII)
+
+
+def parse_range(text: str) -> slice:
+    """Parse ``START:STOP[:STEP]``, counted from 0 without STOP; START or STOP may be left out.
+
+    Raises:
+        InputError: another form, a negative number, a step of zero, or a range that holds no frame.
+    """
+    match = _RANGE.fullmatch(text.strip())
+    if match is None or not any(match.groups()):
+        raise InputError(f'frame range "{text}" is not START:STOP[:STEP] with whole numbers from 0')
+    start, stop, step = (int(part) if part else None for part in match.groups())
+    return checked_range(slice(start, stop, step))
+
+
+def checked_range(frames: slice) -> slice:
+    """The same range with START and STEP filled in.
+
+    Raises:
+        InputError: no slice, a negative number, a step of zero, or a range that holds no frame.
+    """
+    if not isinstance(frames, slice):
+        raise InputError(f"frames is {frames!r}; a slice is expected, such as slice(0, 100, 2)")
+    start, stop, step = frames.start or 0, frames.stop, 1 if frames.step is None else frames.step
+    text = range_text(frames)
+    if start < 0 or (stop is not None and stop < 0) or step < 0:
+        raise InputError(f"frame range {text} holds a negative number; frames are counted from 0")
+    if step == 0:
+        raise InputError(f"frame range {text} has step 0; the step must be at least 1")
+    if stop is not None and stop <= start:
+        raise InputError(f"frame range {text} is empty; STOP must be larger than START")
+    return slice(start, stop, step)
+
+
+def range_text(frames: slice) -> str:
+    """As `parse_range` takes it."""
+    start, stop = ("" if part is None else str(part) for part in (frames.start, frames.stop))
+    return f"{start}:{stop}" + ("" if frames.step is None else f":{frames.step}")

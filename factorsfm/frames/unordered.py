@@ -1,0 +1,140 @@
+"""Images of a set in any order: reading what can be read, and telling such sets from the frames of a shot."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from factorsfm.frames.folders import list_images, read_image
+from factorsfm.frames.frame import Frame, bgr_image
+from factorsfm.frames.reading import read_frames
+from factorsfm.frames.texture import BLANK_TEXTURE, image_texture
+from factorsfm.support.errors import InputError
+
+logger = logging.getLogger(__name__)
+
+_SAMPLED_PAIRS = 5
+_SAMPLED_WIDTH = 480  # pixels
+_SAMPLED_CORNERS = 200
+_TRACKABLE_SHARE = 0.5  # of the corners, in the median pair, that a shot keeps from frame to frame
+_CHECK_PX = 1.0  # largest forward-backward error of a tracked corner
+_PATCH, _SAME_CORNER = 15, 0.9  # pixels across, and correlation of a corner's surroundings in both images
+
+
+@dataclass(frozen=True, slots=True)
+class Unusable:
+    """An entry of the source that is no image: its position and name, and why."""
+
+    index: int
+    name: str
+    reason: str
+
+
+def read_images(
+    source: str | Path | Iterable[Frame | NDArray[np.uint8]], frames: slice | None = None
+) -> Iterator[Frame | Unusable]:
+    """The images of a set, of any sizes; what cannot be read is reported and does not stop the rest.
+
+    Args:
+        source, frames: as in `read_frames`.
+
+    Raises:
+        InputError: the source is missing or holds no images.
+    """
+    if isinstance(source, str | Path):
+        folder = Path(source)
+        if not folder.is_dir():
+            yield from read_frames(source, frames)
+            return
+        paths = list_images(folder)
+        for index in range(len(paths))[frames or slice(None)]:
+            try:
+                yield Frame(index, read_image(paths[index]), paths[index].name, path=paths[index])
+            except InputError as error:
+                yield Unusable(index, paths[index].name, str(error).replace(f"image {paths[index]}", "it"))
+        return
+    for index, image in list(enumerate(source))[frames or slice(None)]:
+        try:
+            if isinstance(image, Frame):
+                yield image
+            else:
+                yield Frame(index, bgr_image(image, index), f"{index:06d}")
+        except InputError as error:
+            yield Unusable(index, f"{index:06d}", str(error))
+
+
+def other_files(source: Path) -> list[str]:
+    """Names of the files in a folder that are no images."""
+    if not source.is_dir():
+        return []
+    images = set(list_images(source))
+    return sorted(p.name for p in source.iterdir() if p.is_file() and p not in images and not p.name.startswith("."))
+
+
+def looks_unordered(source: Path, frames: slice | None = None) -> bool:
+    """Whether a folder holds single photographs rather than the frames of a shot.
+
+    It does where the names without their numbers differ, or where most of a few consecutive pairs have different sizes
+    or share so little that corners cannot be tracked from one to the next.
+    """
+    if not source.is_dir():
+        return False
+    paths = list_images(source)[frames or slice(None)]
+    if len(paths) < 2:
+        return False
+    reason = _why_unordered(paths)
+    if reason:
+        logger.info("%s is taken as an unordered set: %s", source, reason)
+    return bool(reason)
+
+
+def _why_unordered(paths: list[Path]) -> str:
+    patterns = {path.stem.rstrip("0123456789") for path in paths}
+    if len(patterns) > 1 or any(not path.stem[-1:].isdigit() for path in paths):
+        return "the names are not numbered alike"
+    shares = []
+    for k in np.unique(np.linspace(0, len(paths) - 2, _SAMPLED_PAIRS).astype(int)):
+        try:
+            first, second = read_image(paths[k]), read_image(paths[k + 1])
+        except InputError:
+            continue
+        shares.append(_trackable_share(first, second) if first.shape == second.shape else 0.0)
+    if shares and np.median(shares) < _TRACKABLE_SHARE:
+        return f"{100 * np.median(shares):.0f} % of the corners can be tracked from one image to the next"
+    return ""
+
+
+def _trackable_share(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> float:
+    """Share of the corners of the first image that are tracked to the second and back, and look the same there."""
+    if min(first.shape[:2]) < _PATCH or image_texture(cv2.cvtColor(first, cv2.COLOR_BGR2GRAY)) < BLANK_TEXTURE:
+        return 1.0  # a blank image says nothing, nor does one that holds no patch
+    size = (_SAMPLED_WIDTH, max(1, round(_SAMPLED_WIDTH * first.shape[0] / first.shape[1])))
+    small = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (first, second))
+    a, b = (cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) for image in small)
+    corners = cv2.goodFeaturesToTrack(a, _SAMPLED_CORNERS, 0.01, 8)
+    if corners is None:
+        return 1.0
+    there, found, _ = cv2.calcOpticalFlowPyrLK(a, b, corners, None)
+    back, found_back, _ = cv2.calcOpticalFlowPyrLK(b, a, there, None)
+    error = np.linalg.norm((back - corners).reshape(-1, 2), axis=1)
+    alike = _correlation(_patches(a, corners), _patches(b, there)) > _SAME_CORNER
+    return float((found.ravel() & found_back.ravel() & (error < _CHECK_PX) & alike).mean())
+
+
+def _patches(image: NDArray[np.uint8], at: NDArray[np.float32]) -> NDArray[np.float64]:
+    """(n, pixels) around each position."""
+    patches = [cv2.getRectSubPix(image, (_PATCH, _PATCH), tuple(map(float, xy))).ravel() for xy in at.reshape(-1, 2)]
+    return np.array(patches, np.float64)
+
+
+def _correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n,) normalised cross-correlation of rows."""
+    a, b = (p - p.mean(axis=1, keepdims=True) for p in (a, b))
+    power = np.sqrt((a * a).sum(axis=1) * (b * b).sum(axis=1))
+    return np.asarray((a * b).sum(axis=1) / np.maximum(power, 1e-9))

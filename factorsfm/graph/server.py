@@ -1,0 +1,81 @@
+"""The process of the keyframe graph: requests on standard input, answers on standard output, until the input ends."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import pickle
+import signal
+import sys
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from factorsfm.graph.keyframe_graph import FactorGraph
+from factorsfm.support.threads import OneThreadEach
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """An update to make: ``update(subject, graph)``, where asked for `anew` on an empty graph.
+
+    Attributes:
+        update: a function of a module, which crosses to the process by its name.
+    """
+
+    update: Callable[[Any, FactorGraph], Any]
+    subject: Any
+    anew: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What the update returned or raised, and its log records: logger, level, message."""
+
+    outcome: Any
+    log: list[tuple[str, int, str]]
+
+
+class _Kept(logging.Handler):
+    """Keeps what is logged for the next answer."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._log: list[tuple[str, int, str]] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._log.append((record.name, record.levelno, record.getMessage()))
+
+    def taken(self) -> list[tuple[str, int, str]]:
+        log, self._log = self._log, []
+        return log
+
+
+def serve() -> None:
+    """Answer requests until nobody can send any."""
+    for number in (signal.SIGINT, signal.SIGTERM):  # what ends the parent ends this process, too, but not before
+        signal.signal(number, signal.SIG_IGN)
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # what libraries print must not get in between
+    kept = _Kept()
+    logging.getLogger().addHandler(kept)
+    graph = FactorGraph()
+    with OneThreadEach(), contextlib.suppress(EOFError, BrokenPipeError, pickle.UnpicklingError):
+        while True:
+            request: Request = pickle.load(sys.stdin.buffer)
+            if request.anew:
+                graph = FactorGraph()
+            outcome = _outcome(request, graph)
+            answers.write(pickle.dumps(Answer(outcome, kept.taken()), pickle.HIGHEST_PROTOCOL))
+            answers.flush()
+    os._exit(0)  # at once: there is nothing to tidy up
+
+
+def _outcome(request: Request, graph: FactorGraph) -> Any:
+    try:
+        return request.update(request.subject, graph)
+    except Exception as error:
+        error.add_note(f"In the process of the graph: {traceback.format_exc()}")
+        return error

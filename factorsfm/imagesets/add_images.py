@@ -1,0 +1,252 @@
+"""Further images for a finished reconstruction: registered on what it has, whose coordinates stay."""
+
+from __future__ import annotations
+
+import time
+import zlib
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from factorsfm.camera.projection import PIXEL_CENTER, normalized_from_pixels
+from factorsfm.frames.frame import Frame
+from factorsfm.frames.reading import read_frames
+from factorsfm.frames.unordered import read_images
+from factorsfm.imagesets.joint_adjustment import View, extended, local_pose
+from factorsfm.imagesets.mapper import SetMapper
+from factorsfm.imagesets.photo_folder import work_folder
+from factorsfm.result.reading import read_result
+from factorsfm.result.reconstruction import FrameResult, Reconstruction
+from factorsfm.support.errors import InputError, ReconstructionError
+from factorsfm.support.options import Options
+from factorsfm.support.similarity import Similarity
+from factorsfm.support.status import FrameStatus, ShotKind
+from factorsfm.support.threads import OneThreadEach
+from factorsfm.tracks.image_tracks import ImageTracks
+from factorsfm.tracks.matches import join_tracks, match_images
+
+Progress = Callable[[str, int, int | None], None]
+
+_MOST_OF_A_SHOT = 40  # frames of a shot with which new images are matched
+_SAME_ASPECT = 0.01
+
+
+def add_images(
+    result: Reconstruction | str | Path,
+    images: str | Path | Iterable[Frame | NDArray[np.uint8]],
+    *,
+    source: str | Path | None = None,
+    frames: slice | None = None,
+    refine: bool = False,
+    work: str | Path | None = None,
+    progress: Progress | None = None,
+) -> Reconstruction:
+    """Register further images of the same lens on a finished reconstruction of a shot or of a set.
+
+    The new images are matched with those of the result; what both see is triangulated from the known poses. Cameras
+    that are known stay exactly where they are, unless they are to be refined; points that new images see, too, become
+    more exact by that.
+
+    Args:
+        result: a reconstruction, or the folder of a result.
+        images: a folder, a video file, or any iterable of images. Images of the result's own source that have no pose
+            yet, or were outside of its range, keep their index; others are counted on from there.
+        source: the images of the result where they are not at their old place any more.
+        frames: range of the new images.
+        refine: adjust all cameras and points together; the result stays in its coordinates as a whole.
+        work: folder for copies, features and matches, from which an interrupted run goes on; None keeps nothing.
+        progress: called with the stage, the images done, and their number where it is known.
+
+    Raises:
+        InputError: the result, its images or the new ones cannot be used.
+        ReconstructionError: no new image can be registered.
+    """
+    begin = time.perf_counter()
+    base = result if isinstance(result, Reconstruction) else read_result(result)
+    report: Progress = progress or (lambda stage, done, total: None)
+    if base.kind is not ShotKind.GENERAL or len(base.registered) < 2:
+        raise InputError("images can only be added to a result whose camera moves: only then are its points in place")
+    if base.has_own_lenses:
+        raise InputError("images can only be added to a result whose frames share one lens, and this one zooms")
+    with work_folder(work) as folder, OneThreadEach():
+        extension = _Extension(base, folder, refine)
+        extension.take_known(source, report)
+        extension.take_new(images, frames, report)
+        extended = extension.run(report)
+    extended.seconds = {**base.seconds, "extension": time.perf_counter() - begin}
+    extended.seconds.pop("total", None)
+    return extended
+
+
+class _Extension:
+    """The images of a result and the new ones, until they are one reconstruction."""
+
+    def __init__(self, base: Reconstruction, folder: Path, refine: bool) -> None:
+        self._base, self._folder, self._refine = base, folder, refine
+        self._frames = [replace(frame) for frame in base.frames]
+        self._known: list[View] = []
+        self._absent: set[int] = set()  # rows of known images that cannot be matched: turned ones, and no files
+        self._new: list[View] = []
+        self._added = list(base.options.get("added", []))
+        # The world in which everything is solved: the first camera, and a median distance of 1.
+        first = base.registered[0].cam_from_world
+        assert first is not None
+        distance = np.linalg.norm(first * base.points, axis=1) if len(base.points) else np.ones(1)
+        unit = float(np.median(1.0 / np.maximum(distance, 1e-9)))
+        self._local = Similarity(unit, np.asarray(first.rotation.matrix()), unit * np.asarray(first.translation))
+        (folder / "images").mkdir(parents=True, exist_ok=True)
+
+    # --- images -------------------------------------------------------------------------------------------------
+
+    def take_known(self, source: str | Path | None, report: Progress) -> None:
+        """The images of the result, as far as they are matched with new ones."""
+        rows = [row for row, frame in enumerate(self._frames) if frame.registered]
+        if not self._base.options.get("unordered") and len(rows) > _MOST_OF_A_SHOT:
+            rows = [rows[k] for k in np.linspace(0, len(rows) - 1, _MOST_OF_A_SHOT).astype(int)]
+        wanted = {row: self._frames[row] for row in rows}
+        report("images of the result", 0, len(rows))
+        sources = self._sources(source)
+        for (part, first), last in zip(sources, [*(f for _, f in sources[1:]), np.inf], strict=True):
+            self._read_known(part, first, {r: f for r, f in wanted.items() if first <= f.index < last})
+        if missing := set(rows) - {view.position for view in self._known} - self._absent:
+            name = self._frames[min(missing)].name
+            raise InputError(f"the image {name} of the result is not in its source; say where it is now (source)")
+
+    def _sources(self, source: str | Path | None) -> list[tuple[Path | None, int]]:
+        """Where images of the result are (None: they were no files), with the index of the first one."""
+        main = source or self._base.options.get("source")
+        if main is None or not Path(str(main)).exists():
+            raise InputError(f"the images of the result are not at {main} any more; say where they are (source)")
+        added = [(None if a["source"] is None else Path(a["source"]), int(a["first"])) for a in self._added]
+        return [(Path(str(main)), 0), *added]
+
+    def _read_known(self, source: Path | None, first: int, wanted: dict[int, FrameResult]) -> None:
+        if source is None:
+            self._absent.update(wanted)
+        if source is None or not wanted:
+            return
+        by_name = {frame.name: row for row, frame in wanted.items()}
+        by_index = {frame.index - first: row for row, frame in wanted.items()}
+        folder = source.is_dir()
+        for image in read_images(source) if folder else read_frames(source, slice(0, max(by_index) + 1)):
+            row = by_name.get(image.name) if folder else by_index.get(image.index)
+            if row is not None and isinstance(image, Frame):
+                if self._misfit(image):
+                    self._absent.add(row)
+                else:
+                    self._known.append(self._view(image, self._frames[row], row))
+
+    def take_new(
+        self, images: str | Path | Iterable[Frame | NDArray[np.uint8]], frames: slice | None, report: Progress
+    ) -> None:
+        """The images to add."""
+        used = {frame.index for frame in self._frames}
+        row_of = {(frame.index, frame.name): row for row, frame in enumerate(self._frames)}
+        names = {frame.name for frame in self._frames if frame.registered}
+        main = self._base.options.get("source")
+        path = Path(images) if isinstance(images, str | Path) else None
+        own = path is not None and main is not None and path.resolve() == Path(str(main)).resolve()
+        first = 0 if own else max(used) + 1
+        for image in read_images(images, frames):
+            report("new images", len(self._new), None)
+            index = first + image.index
+            row = row_of.get((index, image.name))
+            if own and row is not None and self._frames[row].registered:
+                continue
+            name = image.name if path is None or path.is_dir() or own else f"{path.stem}/{image.name}"
+            if name in names or (row is None and index in used):
+                raise InputError(f"the result has an image {name} with the index {index} already; give it another name")
+            frame = FrameResult(index, name, getattr(image, "timestamp", None), FrameStatus.WAITING, "")
+            if row is None:
+                self._frames.append(frame)
+                row = len(self._frames) - 1
+            else:
+                self._frames[row] = frame
+            if not isinstance(image, Frame):
+                frame.status, frame.message = FrameStatus.UNUSABLE, image.reason
+                continue
+            if reason := self._misfit(image):
+                frame.status, frame.message = FrameStatus.UNUSABLE, reason
+                continue
+            self._new.append(self._view(image, frame, row))
+        if not self._new:
+            unusable = [f for f in self._frames[len(self._base.frames) :] if f.status is FrameStatus.UNUSABLE]
+            why = f": {unusable[-1].name} is unusable, {unusable[-1].message}" if unusable else ""
+            where = images if path is not None else "the sequence of images"
+            raise InputError(f"there is no image to add in {where}{why}")
+        if not own:
+            self._added.append({"source": None if path is None else str(path), "first": first})
+
+    def _misfit(self, image: Frame) -> str:
+        """Why an image cannot be of the result's camera; empty where it can."""
+        (height, width), camera = image.image.shape[:2], self._base.camera
+        if abs(width * camera.height / (height * camera.width) - 1.0) < _SAME_ASPECT:
+            return ""
+        return f"{width}x{height} pixels, another format than {camera.width}x{camera.height} of the camera"
+
+    def _view(self, image: Frame, frame: FrameResult, position: int) -> View:
+        file = f"{position:06d}-{zlib.crc32(image.image.tobytes()):08x}.png"
+        target = self._folder / "images" / file
+        if not target.exists() and not cv2.imwrite(str(target), image.image, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
+            raise InputError(f"cannot write to the work folder {self._folder}")
+        none = np.zeros((0, 2))
+        size = image.image.shape[1], image.image.shape[0]
+        return View(frame, position, file, size, np.zeros(0, np.int64), none, np.zeros((0, 3), np.uint8))
+
+    # --- steps --------------------------------------------------------------------------------------------------
+
+    def run(self, report: Progress) -> Reconstruction:
+        """Match, register, adjust."""
+        report("matching", 0, None)
+        views = [*self._known, *self._new]
+        tracks = self._match(views)
+        report("mapping", 0, None)
+        first = len(self._known)
+        mapper = SetMapper(tracks, self._base.camera.mean_focal_length(), Options())
+        known = [view.frame.cam_from_world for view in self._known]
+        mapper.extend({k: local_pose(pose, self._local) for k, pose in enumerate(known) if pose is not None})
+        for view, image in zip(self._new, mapper.images[first:], strict=True):
+            view.frame.status, view.frame.message = image.status, image.message
+            view.frame.observations = len(image.tracks.ids)
+        registered = [view for view in self._new if view.frame.status is FrameStatus.REGISTERED]
+        if not registered:
+            worst = self._new[0].frame
+            reason = f"none of {len(self._new)} new images registered; {worst.name}: {worst.message}"
+            raise ReconstructionError(reason, self._frames)
+        report("adjustment", 0, None)
+        result = extended(self._base, self._frames, views, mapper, self._local, refine=self._refine)
+        result.options = {**self._base.options, "added": self._added}
+        result.notes.append(f"{len(registered)} of {len(self._new)} further images were registered on the result.")
+        for view in self._new:
+            if view not in registered:
+                result.notes.append(f"{view.frame.name} could not be registered: {view.frame.message}.")
+        return result
+
+    def _match(self, views: list[View]) -> list[ImageTracks]:
+        """Tracks of all images, normalised; their pixels and colours are left in the views."""
+        camera = self._base.camera
+        cameras = []
+        for view in views:
+            own = pycolmap.Camera(camera.todict())
+            own.rescale(*view.size)
+            cameras.append(own)
+        names = [view.file for view in views]
+        matches = match_images(self._folder / "matches.db", self._folder / "images", names, cameras)
+        joined = join_tracks(matches.keypoints, matches.pairs)
+        tracks = []
+        for k, (view, keypoints, (ids, rows)) in enumerate(zip(views, matches.keypoints, joined, strict=True)):
+            scale = np.array([camera.width, camera.height]) / view.size
+            xy = (keypoints[rows] + PIXEL_CENTER) * scale - PIXEL_CENTER
+            uv = normalized_from_pixels(camera, xy)
+            good = np.isfinite(uv).all(axis=1)
+            view.ids, view.xy = ids[good], xy[good]
+            image = np.asarray(cv2.imread(str(self._folder / "images" / view.file)), np.uint8)
+            x, y = np.clip(np.rint(keypoints[rows][good]).astype(int), 0, np.array(view.size) - 1).T
+            view.rgb = image[y, x][:, ::-1]
+            tracks.append(ImageTracks(k, view.ids, uv[good]))
+        return tracks

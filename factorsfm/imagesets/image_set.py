@@ -1,0 +1,397 @@
+"""Unordered photographs in, a reconstruction out: the counterpart of `stream` for image sets."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from factorsfm.camera.guess import first_focal_std, guess_camera
+from factorsfm.camera.projection import PIXEL_CENTER, lens_shape, normalized_from_pixels, with_focal, with_lens
+from factorsfm.control.known import Control, LocatedControl, locate
+from factorsfm.frames.frame import Frame, bgr_image
+from factorsfm.imagesets.cameras import describe_cameras, find_cameras
+from factorsfm.imagesets.mapper import SetMapper, map_parts
+from factorsfm.imagesets.photo_folder import Photo, PhotoFolder
+from factorsfm.lens.lens import LensEstimate
+from factorsfm.mapping.mapped_images import MappedImage
+from factorsfm.polish.polish import polish
+from factorsfm.priors.depth import DepthKind, DepthPrior
+from factorsfm.priors.masks import MaskPrior
+from factorsfm.priors.read_priors import read_depth, read_mask
+from factorsfm.result.assembly import assemble
+from factorsfm.result.reconstruction import FrameResult, Reconstruction
+from factorsfm.support.errors import InputError, ReconstructionError
+from factorsfm.support.options import Options
+from factorsfm.support.status import FrameStatus
+from factorsfm.support.threads import OneThreadEach
+from factorsfm.tracks.image_tracks import ImageTracks
+from factorsfm.tracks.learned import LearnedFeatures
+from factorsfm.tracks.matches import join_tracks, match_images
+
+Array = NDArray[np.float64]
+Progress = Callable[[str, int, int | None], None]
+
+logger = logging.getLogger(__name__)
+
+_LEAST_KEYPOINTS = 30
+_WIDE_PARALLAX = 0.3  # of a map that determines the principal point of an unknown lens
+
+
+class ImageSet:
+    """Reconstruction of an unordered set of photographs.
+
+    Images of another size but the same aspect ratio count as scaled, upright ones in a set of landscape format (or the
+    reverse) are turned; images with another aspect ratio, or with another focal length in their EXIF data, come from a
+    camera of their own (`set_cameras`).
+
+    Args:
+        folder: working copies, features and matches lie here; a second run with the same images goes on from them.
+        camera: the lens of its format; None takes the focal length from the EXIF data or a guess, and refines it.
+            Focal lengths are refined by a common factor; where the parallax is large, also the principal point.
+        depth: prior, or None.
+        masks: what to ignore, or None.
+        features: "sift"; the name of learned ones, see `tracks.learned.FEATURES`; or a folder with their networks.
+        options: see `Options`; None is the default preset.
+        control: what is known beforehand of poses and points, for the largest part of a set that falls apart; pixels
+            are those of the images themselves.
+
+    Raises:
+        ModelError: the networks of the features are not there.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        camera: pycolmap.Camera | None = None,
+        *,
+        depth: DepthPrior | None = None,
+        masks: MaskPrior | None = None,
+        features: str | Path = "sift",
+        options: Options | None = None,
+        control: Control | None = None,
+    ) -> None:
+        self.camera = camera
+        self._lens_given = camera is not None
+        self.control = control
+        options = options or Options()
+        self._lens_is_open = camera is None and options.lens == "auto"
+        if camera is None:
+            options = options.for_unknown_lens()
+        self.options = _for_image_sets(options)
+        self.photos: list[Photo] = []
+        self.seconds: dict[str, float] = defaultdict(float)
+        self.notes: list[str] = []
+        self._depth = depth if options.uses_depth else None
+        self._masks = masks
+        self._features = None if str(features) == "sift" else LearnedFeatures(features)
+        self._database = folder / ("matches.db" if self._features is None else f"matches-{self._features.name}.db")
+        self._files = PhotoFolder(folder, masked=masks is not None)
+        self._cameras: list[pycolmap.Camera] = []  # of the images at full size, that of the map's pixels first
+
+    def add(self, frame: Frame) -> None:
+        """Take an image.
+
+        Raises:
+            InputError: it is no image, or a mask fails on it; the set can go on with other images.
+        """
+        image = bgr_image(frame.image, frame.index)
+        with self._timed("masks"):
+            mask = read_mask(self._masks, frame)
+        with self._timed("reading"):
+            photo = self._files.keep(frame, image, mask, len(self.photos))
+            self.photos.append(photo)
+            if frame.path is not None:
+                guess = guess_camera(*photo.full_size, frame.path)
+                if guess.has_prior_focal_length:
+                    photo.focal_ratio = guess.focal_length / max(photo.full_size)
+
+    def note(self, sentence: str) -> None:
+        """Take note of something that a user should read in the result."""
+        logger.warning("%s", sentence)
+        self.notes.append(sentence)
+
+    def leave_out(self, index: int, name: str, reason: str) -> None:
+        """Take note of an image that cannot be used."""
+        logger.warning("%s is left out: %s", name, reason)
+        self.photos.append(Photo(index, name, None, left_out=reason))
+
+    def finish(self, progress: Progress | None = None) -> Reconstruction:
+        """Match, map and polish.
+
+        Raises:
+            InputError: the camera is made for images of another format than any of these, or the control names an
+                image that is not there.
+            ReconstructionError: fewer than two images can be used or registered.
+        """
+        report: Progress = progress or (lambda stage, done, total: None)
+        camera = self._find_cameras()
+        control = self._located_control()
+        used = [k for k, photo in enumerate(self.photos) if not photo.left_out and photo.twin is None]
+        if len(used) < 2:
+            raise self._failure(f"{len(used)} of {len(self.photos)} images can be used, at least 2 needed", [])
+        report("matching", 0, None)
+        tracks, pixels = self._match(used)
+        colors = self._look_up(used, tracks, pixels, report)
+        report("mapping", 0, None)
+        focal = 0.5 * (camera.focal_length_x + camera.focal_length_y)
+        with self._timed("mapping"), OneThreadEach():
+            parts = map_parts(tracks, focal, self.options)
+        self._explain(parts)
+        if parts[0].registered < 2:
+            images = parts[0].images
+            worst = next(k for k in used if not images[k].registered)
+            raise self._failure(
+                f"{parts[0].registered} of {len(self.photos)} images registered, at least 2 needed; "
+                f"{self.photos[worst].name}: {images[worst].message}",
+                images,
+            )
+        result = self._solve(parts[0], camera, pixels, colors, report, control)
+        result.others = [self._solve(part, camera, pixels, colors, report, None) for part in parts[1:]]
+        for number, part in enumerate((result, *result.others), 1):
+            part.notes += self._summary(part, number, parts)
+            part.seconds = dict(self.seconds)
+        return result
+
+    # --- cameras ------------------------------------------------------------------------------------------------
+
+    def _find_cameras(self) -> pycolmap.Camera:
+        """The first camera at the size of its working copies; its pixels are those of the map's errors."""
+        photos = [photo for photo in self.photos if not photo.left_out and photo.twin is None]
+        if not photos:
+            raise self._failure("there is no image that can be read", [])
+        self._cameras = find_cameras(photos, self._files, self.camera)
+        if sentence := describe_cameras(self._cameras, photos, self.camera is not None):
+            self.note(sentence)
+        for photo in self.photos:
+            if photo.twin is not None:
+                photo.camera = self.photos[photo.twin].camera
+        sizes = Counter(photo.size for photo in photos if photo.camera == 0)
+        return _resized(self._cameras[0], sizes.most_common(1)[0][0])
+
+    def _located_control(self) -> LocatedControl | None:
+        """The control, its marks normalised by the cameras of their images."""
+
+        def normalized(position: int, xy: Array) -> Array:
+            photo = self.photos[position]
+            if photo.left_out or photo.file.endswith("-turned.png"):
+                raise InputError(f"control: points are marked in {photo.name}, {photo.left_out or photo.remark}")
+            own = self._cameras[photo.camera]
+            factor = np.array([own.width, own.height]) / photo.full_size
+            return normalized_from_pixels(own, (xy + PIXEL_CENTER) * factor - PIXEL_CENTER)
+
+        return None if self.control is None else locate(self.control, self.photos, normalized)
+
+    # --- steps --------------------------------------------------------------------------------------------------
+
+    def _match(self, used: list[int]) -> tuple[list[ImageTracks], list[Array]]:
+        """Tracks of all images, normalised, and their pixels at the full size of their cameras."""
+        cameras = [_resized(self._cameras[self.photos[k].camera], self.photos[k].size) for k in used]
+        names = [self.photos[k].file for k in used]
+        with self._timed("matching"):
+            matches = match_images(
+                self._database, self._files.images, names, cameras, self._files.masks, self._features
+            )
+            joined = join_tracks(matches.keypoints, matches.pairs)
+        none = np.zeros(0, np.int64), np.zeros((0, 2))
+        tracks = [ImageTracks(k, *none) for k in range(len(self.photos))]
+        pixels = [np.zeros((0, 2))] * len(self.photos)
+        for k, own, keypoints, (ids, rows) in zip(used, cameras, matches.keypoints, joined, strict=True):
+            if len(keypoints) < _LEAST_KEYPOINTS:
+                self.photos[k].remark = f"{len(keypoints)} of {_LEAST_KEYPOINTS} needed keypoints: hardly any texture"
+            xy = np.asarray(own.cam_from_img(keypoints[rows] + PIXEL_CENTER), np.float64).reshape(-1, 2)
+            good = np.isfinite(xy).all(axis=1)
+            full = self._cameras[self.photos[k].camera]
+            scale = np.array([full.width, full.height]) / self.photos[k].size
+            tracks[k] = ImageTracks(k, ids[good], xy[good])
+            pixels[k] = (keypoints[rows][good] + PIXEL_CENTER) * scale - PIXEL_CENTER
+        return tracks, pixels
+
+    def _look_up(
+        self, used: list[int], tracks: list[ImageTracks], pixels: list[Array], progress: Progress
+    ) -> NDArray[np.uint8]:
+        """Depth of the tracks, in place, and their colours (RGB by track id)."""
+        count = max((int(t.ids[-1]) + 1 for t in tracks if len(t.ids)), default=0)
+        colors = np.zeros((count, 3), np.uint8)
+        for done, k in enumerate(used):
+            progress("depth", done, len(used))
+            photo = self.photos[k]
+            image = self._files.read(photo)
+            full = self._cameras[photo.camera]
+            scale = np.array(photo.size) / [full.width, full.height]
+            xy = (pixels[k] + PIXEL_CENTER) * scale - PIXEL_CENTER
+            x, y = np.clip(np.rint(xy).astype(int), 0, np.array(photo.size) - 1).T
+            colors[tracks[k].ids] = image[y, x][:, ::-1]
+            if self._depth is not None and len(xy):
+                with self._timed("depth"):
+                    frame = Frame(photo.index, image, photo.name, photo.timestamp)
+                    tracks[k] = replace(tracks[k], depth=read_depth(self._depth, frame, xy))
+        return colors
+
+    def _solve(
+        self,
+        part: SetMapper,
+        camera: pycolmap.Camera,
+        pixels: list[Array],
+        colors: NDArray[np.uint8],
+        progress: Progress,
+        control: LocatedControl | None,
+    ) -> Reconstruction:
+        """The polished result of a map; cameras that are far apart determine the principal point of a lens, too."""
+        options = self.options
+        if self._lens_is_open and part.parallax > _WIDE_PARALLAX:
+            options = replace(options, lens="all")
+        with self._timed("polish"), OneThreadEach():
+            try:
+                polished = polish(
+                    part.images,
+                    part.points.all(),
+                    np.array([part.focal]),
+                    options,
+                    lambda stage: progress(stage, 0, None),
+                    lens_shape(camera) if options.estimates_lens else None,
+                    control=control and _scaled(control, camera.mean_focal_length() / part.focal),
+                    first_focal=(np.array([part.first_focal]), first_focal_std(camera, given=self._lens_given)),
+                )
+            except ReconstructionError as error:
+                raise self._failure(str(error), part.images) from error
+        result = assemble(
+            polished,
+            part.images,
+            self.photos,
+            pixels,
+            colors,
+            camera,
+            lens_given=self._lens_given,
+            prior_given=self._depth is not None,
+            metric=self._depth is not None and self._depth.kind is DepthKind.METRIC,
+            seconds={},
+            options=options.to_dict(),
+        )
+        self._add_lenses(result, camera, polished.lens)
+        self._add_twins(result)
+        return result
+
+    # --- the report ---------------------------------------------------------------------------------------------
+
+    def _explain(self, parts: list[SetMapper]) -> None:
+        """Say of every image that is not in a part why, and where it is instead."""
+        home = {i.tracks.position: p for p, part in enumerate(parts) for i in part.images if i.registered}
+        for p, part in enumerate(parts):
+            for k, (photo, image) in enumerate(zip(self.photos, part.images, strict=True)):
+                if photo.left_out:
+                    image.status, image.message = FrameStatus.UNUSABLE, photo.left_out
+                elif k in home and home[k] != p:
+                    reason = "" if image.status is FrameStatus.REGISTERED else f"{image.message}; "
+                    image.status = FrameStatus.LOST
+                    image.message = f"{reason}it is in part {home[k] + 1}, of {parts[home[k]].registered} images"
+                elif photo.remark and not image.registered:
+                    blank = "keypoints" in photo.remark
+                    image.status = FrameStatus.BLANK if blank else image.status
+                    image.message = photo.remark if blank else f"{image.message}; {photo.remark}"
+
+    def _add_twins(self, result: Reconstruction) -> None:
+        """An image with the pixels of another one has its pose."""
+        for photo, frame in zip(self.photos, result.frames, strict=True):
+            if photo.twin is not None and not photo.left_out:
+                twin = result.frames[photo.twin]
+                frame.status, frame.cam_from_world = twin.status, twin.cam_from_world
+                frame.covariance, frame.observability = twin.covariance, twin.observability
+                fate = "whose pose it has" if twin.registered else twin.message
+                frame.message = f"the same image as {twin.name}, {fate}"
+            elif photo.remark and frame.registered:
+                frame.message += f"; {photo.remark}"
+
+    def _add_lenses(self, result: Reconstruction, first: pycolmap.Camera, lens: LensEstimate | None) -> None:
+        """The lenses of the images at full size, and errors in their pixels instead of those of the map."""
+        ratio = result.camera.mean_focal_length() / first.mean_focal_length()
+        shape = lens.lens.shape if lens is not None and self.camera is None and lens.lens.bends else None
+        lenses = []
+        for k, camera in enumerate(self._cameras):
+            focal = ratio * camera.mean_focal_length()
+            own = with_focal(camera, focal) if shape is None else with_lens(camera, focal, shape)
+            lenses.append(_resized(result.camera, (camera.width, camera.height)) if k == 0 else own)
+        shared = Counter(p.camera for p, f in zip(self.photos, result.frames, strict=True) if f.registered)
+        most = shared.most_common(1)[0][0]
+        factor = np.array([lenses[photo.camera].mean_focal_length() for photo in self.photos])
+        factor /= result.camera.mean_focal_length()
+        result.camera = lenses[most]
+        result.observation_error = result.observation_error * factor[result.observation_frame]
+        for frame, photo, own_factor in zip(result.frames, self.photos, factor.tolist(), strict=True):
+            if photo.camera != most:
+                frame.camera = lenses[photo.camera]
+            frame.reprojection_error *= own_factor
+            if frame.observability is not None:
+                slide = frame.observability.pixel_slide * own_factor
+                frame.observability = replace(frame.observability, pixel_slide=slide)
+
+    def _summary(self, result: Reconstruction, number: int, parts: list[SetMapper]) -> list[str]:
+        notes = [f"{photo.name}: {photo.left_out}." for photo in self.photos if photo.left_out]
+        notes += [f"{photo.name}: {photo.remark}." for photo in self.photos if photo.remark]
+        if len(parts) > 1:
+            sizes = ", ".join(str(part.registered) for part in parts)
+            notes.append(
+                f"The images fall into {len(parts)} parts that could not be joined, of {sizes} images; this is "
+                f"part {number}, and each has a scale and a world of its own."
+            )
+        found = {i.tracks.position for part in parts for i in part.images if i.registered}
+        missing = [
+            frame
+            for k, (frame, photo) in enumerate(zip(result.frames, self.photos, strict=True))
+            if not photo.left_out and k not in found and photo.twin not in found
+        ]
+        if missing:
+            some = "; ".join(f"{frame.name}: {frame.message}" for frame in missing[:3])
+            notes.append(f"{len(missing)} of {len(result.frames)} images could not be registered ({some}).")
+        twins = [photo for photo in self.photos if photo.twin is not None and not photo.left_out]
+        if twins:
+            some = ", ".join(f"{photo.name} (as {self.photos[photo.twin or 0].name})" for photo in twins[:5])
+            notes.append(f"Images that repeat another one have its pose: {some}{', …' if len(twins) > 5 else ''}.")
+        return self.notes + notes
+
+    def _failure(self, message: str, images: list[MappedImage]) -> ReconstructionError:
+        frames = []
+        for k, photo in enumerate(self.photos):
+            status, reason = (FrameStatus.UNUSABLE, photo.left_out) if photo.left_out else (FrameStatus.WAITING, "")
+            if images and not photo.left_out:
+                status, reason = images[k].status, images[k].message
+            frames.append(FrameResult(photo.index, photo.name, photo.timestamp, status, reason))
+        return ReconstructionError(message, frames)
+
+    @contextmanager
+    def _timed(self, stage: str) -> Iterator[None]:
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[stage] += time.perf_counter() - start
+
+
+def _for_image_sets(options: Options) -> Options:
+    """Two views make a track, wrong matches are single observations, and keypoints are less exact than tracks."""
+    return replace(
+        options,
+        polish=replace(
+            options.polish, min_track_length=2, final_iterations=20, observation_sigmas=12.0, doubtful_px=0.6
+        ),
+    )
+
+
+def _scaled(control: LocatedControl, ratio: float) -> LocatedControl:
+    """What was marked with another focal length; `ratio`: the former one over the new one."""
+    return replace(control, marks=replace(control.marks, xy=control.marks.xy * ratio))
+
+
+def _resized(camera: pycolmap.Camera, size: tuple[int, int]) -> pycolmap.Camera:
+    """A copy for images of another size."""
+    other = pycolmap.Camera(camera.todict())
+    other.rescale(*size)
+    return other

@@ -1,0 +1,351 @@
+"""The incremental mapper for unordered images: start, next best image, triangulate, adjust.
+
+The steps are those of `mapper`; what differs is the order, which is chosen, and the adjustment: images are far apart
+here, so that all of them are adjusted together, on their best tracks, whenever the map has grown.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
+from factorsfm.adjustment.gather import gather
+from factorsfm.imagesets.covisibility import common_tracks, components, longest_tracks, pyramid_score, track_lengths
+from factorsfm.imagesets.start import SIGMA_PX, median_angle, possible_starts
+from factorsfm.mapping.mapped_images import MappedImage, renormalize, state_of
+from factorsfm.mapping.point_map import PointMap
+from factorsfm.mapping.registration import register_image
+from factorsfm.mapping.starts import NoStart, Start
+from factorsfm.mapping.triangulation import triangulate
+from factorsfm.support.options import Options
+from factorsfm.support.status import FrameStatus
+from factorsfm.tracks.image_tracks import ImageTracks
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+logger = logging.getLogger(__name__)
+
+_SMALLEST_PART = 3  # images, besides those of the first part
+_LEAST_ANGLE_DEG = 1.5  # between the rays of a new point; less where those of the whole map are small
+_LEAST_ANGLE_SHARE = 0.3  # of the median angle of the map
+_WORKING_TRACKS = (150, 1000, 60_000)  # per image while the map grows: at least, at most, and in the whole set
+_LEAST_FITTING, _MOST_CONTRADICTED = 0.5, 0.25  # shares of an image's observations, and of the images
+_GROWTH = 0.1  # of the number of images after which the map is adjusted
+_GOOD_PX = 4.0  # reprojection error of a good observation
+_FOCAL_IMAGES, _FOCAL_ANGLE_DEG = 4, 3.0  # from which a guessed focal length is refined with the map
+
+
+def map_parts(tracks: list[ImageTracks], focal: float, options: Options) -> list[SetMapper]:
+    """A map of the images that belong together, and others among those that are left over.
+
+    What cannot be joined to a map, for want of common tracks or because no pose agrees with it, gets a map of its own
+    where at least three images make one.
+
+    Returns:
+        The maps by number of images, largest first. An image is registered in one of them at most; where it is not,
+        its message says why it is not in the first map that was made. That one is there even without images.
+    """
+    parts: list[SetMapper] = []
+    nothing = np.zeros(0, np.int64), np.zeros((0, 2))
+    while True:
+        mapper = SetMapper(tracks, focal, options)
+        mapper.run()
+        tried = [image for image in mapper.images if image.status is not FrameStatus.TOO_FEW_TRACKS]
+        found = [image for image in mapper.images if image.registered]
+        if not parts or len(found) >= _SMALLEST_PART:
+            parts.append(mapper)
+        done = {image.tracks.position for image in (found if len(found) >= _SMALLEST_PART else tried)}
+        if not done:
+            break
+        tracks = [ImageTracks(t.position, *nothing) if t.position in done else t for t in tracks]
+    for part in parts[1:]:  # there, images were missing
+        for image, first in zip(part.images, parts[0].images, strict=True):
+            if not image.registered:
+                image.status, image.message = first.status, first.message
+    return sorted(parts, key=lambda part: -part.registered)
+
+
+class SetMapper:
+    """Depth-guided incremental structure from motion over the tracks of an unordered set.
+
+    Args:
+        tracks: of all images, with the depth prior where there is one.
+        focal: pixels; a guess that is refined with the map where the options say so.
+        options: steps, thresholds and weights.
+
+    Attributes:
+        images: what became of each image; points: the map.
+        focal: as the tracks of `images` are normalised with it; first_focal: what was thought of it at first.
+    """
+
+    def __init__(self, tracks: list[ImageTracks], focal: float, options: Options) -> None:
+        self.focal = focal
+        self.options = options.mapper
+        self._refine_focal = options.refine_focal_length
+        self.first_focal = focal
+        self._adjustment = replace(options.polish, iterations=10, tolerance=1e-3)
+        self.images = [MappedImage(t, FrameStatus.WAITING, "waiting for the start of the map") for t in tracks]
+        self.points = PointMap()
+        self._common = common_tracks(tracks)
+        self._order: list[MappedImage] = []  # of registration; the first one is the world
+        self._adjusted = 0
+        self._tried: dict[int, int] = {}  # by position: mapped tracks with which an image was tried last
+        self._scores: dict[int, tuple[int, int]] = {}  # by position: mapped tracks, and their score
+        self._released: set[int] = set()  # positions of images that were taken out of the map again, once each
+        self._held: set[int] = set()  # positions of the images whose poses are given
+        self._angle = 0.0  # median angle between the rays of the latest points, degrees
+
+    @property
+    def registered(self) -> int:
+        """Number of images with a pose."""
+        return sum(image.registered for image in self.images)
+
+    @property
+    def parallax(self) -> float:
+        """Largest distance of a camera from the first one, over the median distance of the points from that."""
+        centers = np.array([-rotation.T @ translation for rotation, translation in (i.pose for i in self._order)])
+        distance = float(np.median(np.linalg.norm(self.points.all()[1] - centers[0], axis=1)))
+        return float(np.linalg.norm(centers - centers[0], axis=1).max()) / distance
+
+    # --- the algorithm ------------------------------------------------------------------------------------------
+
+    def run(self) -> None:
+        """Register all images that can be."""
+        usable = self._usable()
+        best: list[MappedImage] = []
+        best_points = self.points
+        tracks = [self.images[k].tracks for k in usable]
+        starts = possible_starts(tracks, self._common[np.ix_(usable, usable)], self.options, self.focal)
+        if isinstance(starts, NoStart):
+            for k in usable:
+                self.images[k].message = starts.reason
+            return
+        least, most, total = _WORKING_TRACKS
+        working = longest_tracks(tracks, int(np.clip(total // len(tracks), least, most)))
+        for start in starts:
+            self._begin(start)
+            self._grow(working)
+            if len(self._order) > len(best):
+                best, best_points = [replace(image) for image in self._order], self.points
+            if len(best) > len(usable) // 2:
+                break
+        for image in best:  # the tracks as they are normalised now
+            self.images[image.tracks.position] = replace(image, tracks=self.images[image.tracks.position].tracks)
+        self._order = [self.images[image.tracks.position] for image in best]
+        self.points = best_points
+        if self._order:
+            self._grow(None)
+            self._say_what_is_missing()
+
+    def extend(self, known: dict[int, tuple[Array, Array]]) -> None:
+        """Register all images that can be on those whose poses are known, which stay as they are.
+
+        Args:
+            known: `cam_from_world` rotation and translation by position, the first one near the origin of a world with
+                a median distance of about 1.
+        """
+        for position, pose in known.items():
+            self._accept(self.images[position], *pose, 0)
+        self._held = set(known)
+        self._grow(None)
+        self._say_what_is_missing()
+
+    def _say_what_is_missing(self) -> None:
+        for image in self.images:
+            if image.status is FrameStatus.WAITING:
+                mapped = int(self.points.contains(image.tracks.ids).sum())
+                image.status = FrameStatus.LOST
+                image.message = f"{mapped} of {self.options.min_inliers} needed tracks have a point in the map"
+
+    def _usable(self) -> list[int]:
+        """The images of the largest component; the others learn why they are left out."""
+        o = self.options
+        component = components(self._common >= o.min_inliers)
+        size = Counter(component.tolist())
+        largest = max(size, key=lambda c: size[c])
+        for image, c in zip(self.images, component.tolist(), strict=True):
+            tracks = len(image.tracks.ids)
+            image.status = FrameStatus.TOO_FEW_TRACKS
+            if size[c] == 1:
+                most = int(self._common[image.tracks.position].max(initial=0))
+                image.message = (
+                    f"{most} of {o.min_inliers} needed tracks in common with any other image, {tracks} in all"
+                )
+            elif c != largest:
+                others = int(self._common[image.tracks.position][component == largest].max(initial=0))
+                image.message = (
+                    f"belongs to a part of {size[c]} images; with the largest part, of {size[largest]} images, it has "
+                    f"{others} of {o.min_inliers} needed tracks in common"
+                )
+            elif tracks < o.min_tracks:
+                image.message = f"{tracks} of {o.min_tracks} needed tracks"
+            else:
+                image.status, image.message = FrameStatus.WAITING, "waiting for the start of the map"
+        return [k for k, image in enumerate(self.images) if image.status is FrameStatus.WAITING]
+
+    def _grow(self, working: Index | None) -> None:
+        """Register one image after the other, on some of the tracks (ascending ids) or on all."""
+        self._extend(working)
+        self._adjust()
+        self._tried.clear()
+        while True:
+            while (image := self._next()) is not None:
+                if self._register(image):
+                    self._extend(working, image)
+                    if len(self._order) >= self._adjusted * (1.0 + _GROWTH):
+                        self._adjust()
+                        self._extend(working)
+            if len(self._order) == self._adjusted:
+                return
+            self._adjust()  # images that it releases come next
+            self._extend(working)
+
+    def _begin(self, start: Start) -> None:
+        for image in self._order:
+            image.rotation = image.translation = None
+        self.points, self._order, self._adjusted = PointMap(), [], 0
+        self._released.clear()
+        self._angle = median_angle(start)
+        self.points.set(start.ids, start.points)
+        for position, rotation, translation in zip(start.images, start.rotation, start.translation, strict=True):
+            self._accept(self.images[position], rotation, translation, len(start.ids))
+
+    # --- registration -------------------------------------------------------------------------------------------
+
+    def _next(self) -> MappedImage | None:
+        """The image with most and best spread mapped tracks; one that failed waits until it sees more of the map."""
+        best, best_score = None, 0
+        for image in self.images:
+            if image.registered or image.status is FrameStatus.TOO_FEW_TRACKS:
+                continue
+            position, mapped = image.tracks.position, self.points.contains(image.tracks.ids)
+            n = int(mapped.sum())
+            if n < self.options.min_inliers or n < 1.2 * self._tried.get(position, 0):
+                continue
+            if self._scores.get(position, (0, 0))[0] != n:  # the same where the map has not grown in its sight
+                self._scores[position] = n, pyramid_score(image.tracks.xy, mapped)
+            if self._scores[position][1] > best_score:
+                best, best_score = image, self._scores[position][1]
+        if best is not None:
+            self._tried[best.tracks.position] = self._scores[best.tracks.position][0]
+        return best
+
+    def _register(self, image: MappedImage) -> bool:
+        o, tracks = self.options, image.tracks
+        mapped = self.points.contains(tracks.ids)
+        near = max(self._order, key=lambda i: int(self._common[i.tracks.position, tracks.position]))
+        result = register_image(
+            self.points.at(tracks.ids[mapped]),
+            tracks.xy[mapped],
+            *near.pose,
+            focal=self.focal,
+            sigma=SIGMA_PX,
+            inlier_px=o.inlier_px,
+        )
+        found = int(result.inliers.sum())
+        logger.debug("image %d: %d of %d inliers, %.2f px", tracks.position, found, mapped.sum(), result.error)
+        if found < o.min_inliers:
+            image.status = FrameStatus.TOO_FEW_INLIERS
+            image.message = f"{found} of {o.min_inliers} needed inliers among {mapped.sum()} mapped tracks"
+            return False
+        self._accept(image, result.rotation, result.translation, found)
+        return True
+
+    def _accept(self, image: MappedImage, rotation: Array, translation: Array, inliers: int) -> None:
+        image.rotation, image.translation, image.inliers = rotation, translation, inliers
+        image.status, image.message, image.keyframe = FrameStatus.REGISTERED, f"{inliers} inliers", True
+        self._order.append(image)
+
+    # --- points -------------------------------------------------------------------------------------------------
+
+    def _extend(self, working: Index | None, image: MappedImage | None = None) -> None:
+        """Triangulate what has no point yet: of the working tracks, of one image or of all."""
+        order = self._order
+        if image is not None:  # a map of any size costs no more than what the image has to do with
+            position = image.tracks.position
+            order = [i for i in order if i is image or self._common[position, i.tracks.position] > 0]
+        seen = track_lengths([i.tracks for i in order]) >= 2
+        ids = np.nonzero(seen)[0] if image is None else image.tracks.ids[seen[image.tracks.ids]]
+        if working is not None:
+            ids = ids[np.isin(ids, working, assume_unique=True)]
+        ids = ids[~self.points.contains(ids)]
+        if not len(ids):
+            return
+        result = triangulate(
+            np.array([i.rotation for i in order]),
+            np.array([i.translation for i in order]),
+            gather([i.tracks for i in order], ids),
+            focal=self.focal,
+            inlier_px=_GOOD_PX,
+            sigma=SIGMA_PX,
+            fallback=np.full(len(ids), 1e-3),
+        )
+        angle = np.degrees(result.angle)
+        good = (result.inliers >= 2) & (result.inverse_distance > 1e-6)
+        if good.any():
+            self._angle = float(np.median(angle[good]))
+        good &= angle > min(_LEAST_ANGLE_DEG, _LEAST_ANGLE_SHARE * self._angle)
+        self.points.set(ids[good], result.bearing[good] / result.inverse_distance[good, None])
+
+    def _adjust(self) -> None:
+        """Bundle adjustment of all registered images; points without two good observations are forgotten."""
+        ids, points = self.points.all()
+        length = track_lengths([i.tracks for i in self._order])
+        kept = ids < len(length)
+        kept[kept] = length[ids[kept]] >= 2
+        ids, points = ids[kept], points[kept]
+        observations = gather([image.tracks for image in self._order], ids)
+        state = state_of(self._order, points, self.focal)
+        errors = BundleAdjustment(state, observations, self._adjustment, sigma=1.0).reprojection_errors()
+        sigma = max(float(np.median(errors)), SIGMA_PX)
+        free_focal = self._refine_focal and len(self._order) >= _FOCAL_IMAGES and self._angle > _FOCAL_ANGLE_DEG
+        held = np.array([image.tracks.position in self._held for image in self._order]) if self._held else None
+        adjustment = BundleAdjustment(
+            state, observations, self._adjustment, sigma=sigma, free_focal=free_focal, fixed=held
+        )
+        state = adjustment.solve()
+        focal = float(np.exp(state.log_focal[0]))
+        if free_focal and 0.3 < focal / self.first_focal < 3.0:
+            self._set_focal(focal)
+        errors = adjustment.reprojection_errors()
+        logger.debug(
+            "adjusted %d images, %d points, %d observations to %.2f px in %d iterations",
+            len(self._order), len(ids), len(errors), np.median(errors), adjustment.iterations,
+        )  # fmt: skip
+        for k, image in enumerate(self._order):
+            image.rotation, image.translation = state.rotation[k], state.translation[k]
+        fits = errors < _GOOD_PX
+        wrong = self._contradicted(observations.frame, fits)
+        supported = np.bincount(observations.point, fits & ~wrong[observations.frame], len(ids)) >= 2
+        good = supported & (state.inverse_distance > 1e-6)
+        self.points = PointMap()
+        self.points.set(ids[good], state.points[good])
+        for image in (image for image, released in zip(self._order, wrong, strict=True) if released):
+            logger.debug("image %d is released: most of the map contradicts it", image.tracks.position)
+            image.forget(FrameStatus.WAITING, "most of the map contradicts its pose")
+            self._released.add(image.tracks.position)
+            self._tried.pop(image.tracks.position, None)
+        self._order = [image for image in self._order if image.registered]
+        self._adjusted = len(self._order)
+
+    def _contradicted(self, frame: Index, fits: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """(k,) images of which few observations fit, where nearly all others agree: a start before a plane makes such.
+
+        They are registered once more, on the map that the others have made.
+        """
+        count = len(self._order)
+        share = np.bincount(frame, fits, count) / np.maximum(np.bincount(frame, minlength=count), 1)
+        settled = self._held | self._released
+        free = np.array([image.tracks.position not in settled for image in self._order])
+        wrong = (share < _LEAST_FITTING) & free
+        return wrong if wrong.sum() <= _MOST_CONTRADICTED * count else np.zeros(count, bool)
+
+    def _set_focal(self, focal: float) -> None:
+        renormalize(self.images, self.focal / focal)
+        self.focal = focal

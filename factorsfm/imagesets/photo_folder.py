@@ -1,0 +1,148 @@
+"""The photographs of an image set: what is known of each, and its working copy."""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from factorsfm.frames.frame import Frame
+from factorsfm.support.errors import InputError
+
+logger = logging.getLogger(__name__)
+
+MAX_SIDE = 3200  # pixels; larger images are matched and reconstructed at this size
+
+
+@dataclass(slots=True)
+class Photo:
+    """What is kept of an image: never its pixels.
+
+    Attributes:
+        index, name, timestamp: see `Frame`.
+        file: its copy in the work folder, empty where the image is left out; size: (width, height) of the copy.
+        full_size: (width, height) of the image itself.
+        left_out: why it takes no part, empty where it does; twin: position of an earlier image with the same pixels.
+        remark: what a user should know of it.
+        focal_ratio: focal length over the longer side from EXIF, 0 where it is unknown.
+        camera: position in the list of the set's cameras.
+    """
+
+    index: int
+    name: str
+    timestamp: float | None
+    file: str = ""
+    size: tuple[int, int] = (0, 0)
+    full_size: tuple[int, int] = (0, 0)
+    left_out: str = ""
+    twin: int | None = None
+    remark: str = ""
+    focal_ratio: float = 0.0
+    camera: int = 0
+
+
+class PhotoFolder:
+    """Working copies of the images and masks of a set, one for all images with the same pixels.
+
+    Args:
+        folder: of the copies; those of an earlier run are used again.
+        masked: whether the images have masks.
+    """
+
+    def __init__(self, folder: Path, *, masked: bool) -> None:
+        self.images = folder / "images"
+        self.masks = folder / "masks" if masked else None
+        self._known: dict[str, int] = {}
+        self.images.mkdir(parents=True, exist_ok=True)
+
+    def keep(self, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None, position: int) -> Photo:
+        """Copy an image, (h, w, 3) BGR, and what is ignored in it.
+
+        Args:
+            position: of the photo in the set.
+
+        Raises:
+            InputError: the folder cannot be written.
+        """
+        height, width = image.shape[:2]
+        photo = Photo(frame.index, frame.name, frame.timestamp, full_size=(width, height))
+        image, mask = _bounded(image, mask)
+        photo.size = image.shape[1], image.shape[0]
+        if max(width, height) > MAX_SIDE:
+            photo.remark = f"reduced from {size_text(photo.full_size)} to {size_text(photo.size)} pixels"
+            logger.warning("%s is %s", frame.name, photo.remark)
+        checksum = zlib.crc32(image.tobytes() + (b"" if mask is None else mask.tobytes()))
+        key = f"{checksum:08x}-{size_text(photo.size)}"
+        photo.file = f"{frame.index:06d}-{key}.png"
+        first = self._known.setdefault(key, position)
+        if first != position:
+            photo.twin = first
+            return photo
+        _write_once(self.images / photo.file, image)
+        if self.masks is not None:
+            ignored = np.zeros(image.shape[:2], bool) if mask is None else mask
+            _write_once(self.masks / f"{photo.file}.png", np.where(ignored, 0, 255).astype(np.uint8))
+        return photo
+
+    def read(self, photo: Photo) -> NDArray[np.uint8]:
+        """The working copy, (h, w, 3) BGR."""
+        return np.asarray(cv2.imread(str(self.images / photo.file)), np.uint8)
+
+    def turn(self, photo: Photo) -> None:
+        """Turn the working copy by 90 degrees."""
+        turned = photo.file.replace(".png", "-turned.png")
+        _write_once(self.images / turned, cv2.rotate(self.read(photo), cv2.ROTATE_90_COUNTERCLOCKWISE))
+        if self.masks is not None:
+            sideways = cv2.imread(str(self.masks / f"{photo.file}.png"), cv2.IMREAD_GRAYSCALE)
+            _write_once(self.masks / f"{turned}.png", cv2.rotate(sideways, cv2.ROTATE_90_COUNTERCLOCKWISE))
+        photo.remark = "turned left by 90 degrees to the format of the others; its pose is that of the turned image"
+        logger.warning("%s is %s", photo.name, photo.remark)
+        photo.file, photo.size, photo.full_size = turned, photo.size[::-1], photo.full_size[::-1]
+
+
+def size_text(size: tuple[int, int]) -> str:
+    """(width, height) in words."""
+    return f"{size[0]}x{size[1]}"
+
+
+def _bounded(
+    image: NDArray[np.uint8], mask: NDArray[np.bool_] | None
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+    height, width = image.shape[:2]
+    factor = MAX_SIDE / max(width, height)
+    if factor >= 1.0:
+        return image, mask
+    size = (max(1, round(width * factor)), max(1, round(height * factor)))
+    reduced = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+    if mask is None:
+        return reduced, None
+    return reduced, cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+
+
+def _write_once(path: Path, image: NDArray[np.uint8]) -> None:
+    """Write a file that is complete or absent."""
+    if path.exists():
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_suffix(".unfinished.png")
+    if not cv2.imwrite(str(unfinished), image, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
+        raise InputError(f"cannot write to the work folder {path.parent}")
+    unfinished.replace(path)
+
+
+@contextmanager
+def work_folder(work: str | Path | None) -> Iterator[Path]:
+    """The folder, or a temporary one where there is none."""
+    if work is not None:
+        yield Path(work)
+        return
+    with tempfile.TemporaryDirectory(prefix="factorsfm-") as folder:
+        yield Path(folder)

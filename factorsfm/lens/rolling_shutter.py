@@ -1,0 +1,236 @@
+"""Rolling shutter: images whose rows are read out one after another while the camera moves.
+
+A row is seen from where the camera is when that row is read. Poses are those of the image's middle; what lies above and
+below it has moved on along its own track, as the frames before and after show. The only unknown is the readout: which
+share of the time between two frames passes from the first to the last row. Rows become columns where a recorded image
+was turned upright, so both directions are tried.
+
+What shows the result over the recorded images (a renderer, a compositor, a splat) mostly knows of no rolling shutter.
+For these, each camera is fitted to its recorded image at the end, on points that are free of it.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
+from factorsfm.adjustment.observations import DISTORTION, READOUT, Observations, Sweep
+from factorsfm.adjustment.residuals import by_pose, cauchy, distort, reprojection
+from factorsfm.adjustment.state import State
+from factorsfm.lens.certainty import lens_deviations
+from factorsfm.lens.lens import READOUT_SIGMA, Lens, LensEstimate, renormalized, shape_sigmas
+from factorsfm.mapping.mapped_images import MappedImage
+from factorsfm.motion.shot_kind import LEAST_GAIN, Motion, translation_gain
+from factorsfm.support.options import Options
+from factorsfm.support.rotations import exponential
+from factorsfm.support.status import ShotKind
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+logger = logging.getLogger(__name__)
+
+_LONGEST = 1.5  # frames: the sensor has to be done before the next one, and an estimate has an error
+_LEAST_STEP = 0.03  # frames, of the first Newton step: a shorter readout is of no consequence
+_TURNING_GAIN = 10.0  # of translation, as in `Motion`, up to which a camera may only turn all the same
+_LEAST_EVIDENCE = 16.0  # squared standard deviations; tracks of an actor without a mask reach 10
+_FEWEST, _ROUNDS = 12, 4  # tracks from which an acceleration over the image is seen, and re-weightings
+_FITS = 5  # steps to the cameras of the recorded images, which are near
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """Images whose rows may have been read one after another.
+
+    Attributes:
+        width, height: pixels.
+        times: (n,) of the images, in frames of the source, ascending.
+    """
+
+    width: int
+    height: int
+    times: Index
+
+
+@dataclass(frozen=True, slots=True)
+class Shutter:
+    """A rolling shutter that the shot shows.
+
+    Attributes:
+        guess: with which the tracks were seen; lens: the same or a better one, with the readout.
+        std: standard deviation of the readout.
+    """
+
+    guess: Lens
+    lens: Lens
+    std: float
+
+    @property
+    def readout(self) -> Array:
+        """(2,) share of the time between frames that the readout takes along columns and rows, one of them zero."""
+        return np.asarray(self.lens.shape[READOUT])
+
+    def known_with(self, estimate: LensEstimate) -> Shutter:
+        """The same beside a lens that was estimated with it."""
+        std = estimate.shape_std[READOUT][self.readout != 0.0]
+        return Shutter(estimate.guess, estimate.lens, float(np.fmax(std, self.std)[0]))
+
+    def recorded(self, observations: Observations, state: State) -> Observations:
+        """What was seen at the time of its pose, back where the recorded images show it; `state`: with its lenses."""
+        focal, still = np.exp(state.log_focal), np.r_[self.lens.shape[DISTORTION], np.zeros(2)]
+        return renormalized(observations, Lens(focal, self.lens.shape), Lens(focal, still), state.group)
+
+    def renormalize(self, observations: Observations, group: Index) -> Observations:
+        """What was seen in the guess, seen at the time of its pose in the lens; `group` as in `State`."""
+        return renormalized(observations, self.guess, self.lens, group)
+
+
+def with_sweep(
+    observations: Observations,
+    tracks: Index,
+    images: Sequence[MappedImage],
+    frames: Sequence[int],
+    guess: Lens,
+    group: Index,
+    recording: Recording,
+) -> Observations:
+    """The observations with `Observations.sweep`, from their tracks in the images before and after.
+
+    Args:
+        tracks: (n,) id of each point; images: all those of the recording; frames: which of them are those of the
+            observations.
+        guess: with which they are undistorted; group: (k,) which of its focal lengths is that of each frame.
+    """
+    gaps = [1, *np.diff(recording.times).tolist(), 1]
+    motion, acceleration, place = (np.zeros_like(observations.xy) for _ in range(3))
+    for k, position in enumerate(frames):
+        rows = np.nonzero(observations.frame == k)[0]
+        ids, focal = tracks[observations.point[rows]], float(guess.focal[group[k]])
+        before, here, after = (_pixels(images, position + step, ids, guess, focal) for step in (-1, 0, 1))
+        velocities = (here - before) / gaps[position], (after - here) / gaps[position + 1]
+        place[rows] = here / (recording.width, recording.height)
+        motion[rows], acceleration[rows] = _motion(*velocities, gaps[position], gaps[position + 1], place[rows])
+    return replace(observations, sweep=Sweep(motion, acceleration, place))
+
+
+def _motion(to: Array, on: Array, time_to: int, time_on: int, place: Array) -> tuple[Array, Array]:
+    """(n, 2) motion and acceleration in an image, from the velocities to it and on from it, NaN where there is none.
+
+    The acceleration is smooth over the image: that of each track by itself would hold the error of the very observation
+    that it is to explain. A track of a single image does not move.
+    """
+    change = 2.0 * (on - to) / (time_to + time_on)
+    acceleration = _smooth(change, place)
+    motion = np.where(np.isnan(to), on - 0.5 * time_on * acceleration, to + 0.5 * time_to * acceleration)
+    both = np.isfinite(change[:, 0])
+    motion[both] = ((to * time_on + on * time_to) / (time_to + time_on))[both]
+    still = np.isnan(motion)
+    return np.where(still, 0.0, motion), np.where(still, 0.0, acceleration)
+
+
+def _smooth(values: Array, place: Array) -> Array:
+    """(n, 2) values, some of them NaN, as a linear function of their places in the image, robustly; 0 for few."""
+    known = np.isfinite(values[:, 0])
+    if known.sum() < _FEWEST:
+        return np.zeros_like(values)
+    design = np.column_stack([np.ones(len(place)), place])
+    weight = np.ones(int(known.sum()))
+    for _ in range(_ROUNDS):
+        root = np.sqrt(weight)[:, None]
+        field, *_ = np.linalg.lstsq(root * design[known], root * values[known], rcond=None)
+        off = values[known] - design[known] @ field
+        weight = cauchy(off, max(float(np.median(np.linalg.norm(off, axis=1))), 1e-9))[1]
+    return np.asarray(design @ field)
+
+
+def _pixels(images: Sequence[MappedImage], position: int, ids: Index, guess: Lens, focal: float) -> Array:
+    """(n, 2) pixels of tracks, from the principal point; NaN where an image does not see them."""
+    known = images[position].tracks.ids if 0 <= position < len(images) else ids[:0]
+    if not len(known):
+        return np.full((len(ids), 2), np.nan)
+    at = np.minimum(np.searchsorted(known, ids), len(known) - 1)
+    xy = images[position].tracks.xy[at]
+    seen = distort(xy, guess.shape)[0] if guess.bends else xy
+    return np.asarray(np.where((known[at] == ids)[:, None], focal * seen, np.nan))
+
+
+def find_shutter(adjustment: BundleAdjustment, motion: Motion, guess: Lens, options: Options) -> Shutter | None:
+    """The rolling shutter where errors hardly explain what the tracks show of one.
+
+    Args:
+        adjustment: converged with the guess, over observations with their sweep; motion: how its camera moves.
+    """
+    if motion.kind is ShotKind.STATIC:
+        return None
+    if motion.gain < _TURNING_GAIN:  # a camera that turns may seem to move, too, since its images are skewed
+        turning = _solved_with_readout(adjustment, motion.rotation_only, guess, options, moves=False)
+        if turning is not None and translation_gain(turning, adjustment) < LEAST_GAIN:
+            return _believed(turning, guess)
+    if motion.kind is ShotKind.ROTATION:
+        return None
+    moving = _solved_with_readout(adjustment, adjustment.state, guess, options, moves=True)
+    return None if moving is None else _believed(moving, guess)
+
+
+def _solved_with_readout(
+    adjustment: BundleAdjustment, start: State, guess: Lens, options: Options, *, moves: bool
+) -> BundleAdjustment | None:
+    """Converged with a readout along rows or columns, None where it is hardly any."""
+    o, state = adjustment.observations, replace(start, lens=guess.shape)
+    shape = shape_sigmas(options.lens, float(np.ptp(o.xy, axis=0).max()))
+
+    def problem(free: NDArray[np.bool_]) -> BundleAdjustment:
+        return BundleAdjustment(
+            state, o, options.polish, sigma=adjustment.sigma, free_translation=moves,
+            free_focal=options.refine_focal_length, lens_sigmas=np.r_[shape, READOUT_SIGMA * free],
+        )  # fmt: skip
+
+    step = np.abs(problem(np.array([True, True])).lens_step()[-2:])
+    if step.max() < _LEAST_STEP:
+        return None
+    solved = problem(np.arange(2) == np.argmax(step))
+    solved.solve()
+    return solved
+
+
+def _believed(solved: BundleAdjustment, guess: Lens) -> Shutter | None:
+    """The shutter of a solution, None where it may be chance."""
+    std, left_out, evidence = lens_deviations(solved, guess.shape, READOUT)
+    readout = solved.state.lens[READOUT]
+    deviation = float(np.nanmax(np.fmax(std, left_out)[-2:]))
+    logger.info("readout %s within %.3f frames, %.0f squared deviations", readout, deviation, evidence)
+    if evidence < _LEAST_EVIDENCE or np.abs(readout).max() > _LONGEST:
+        return None
+    return Shutter(guess, Lens(guess.focal, np.r_[guess.shape[DISTORTION], readout]), deviation)
+
+
+def seen_at_once(state: State, recorded: Observations, weight: Array, *, moves: bool) -> State:
+    """The cameras that show the points most nearly where the recorded images do, as if all were read at once.
+
+    Args:
+        state: with the points, which stay; recorded: see `Shutter.recorded`; weight: (m,) of each observation.
+        moves: whether the camera does more than turn.
+    """
+    free = 6 if moves else 3
+    order = np.argsort(recorded.frame, kind="stable")
+    o, weight = recorded.at(order), weight[order]
+    first = np.searchsorted(o.frame, np.arange(len(state.rotation)))
+    for _ in range(_FITS):
+        q = state.camera_points(o.frame, o.point)
+        residual, by_q = reprojection(q, o.xy, 1.0)
+        by_camera = by_pose(by_q.transpose(1, 0, 2), q, state.inverse_distance[o.point])[:, :, :free]
+        jacobian = by_camera.transpose(1, 0, 2)
+        gain = np.einsum("m,mdi->mid", weight, jacobian)
+        information = np.add.reduceat(gain @ jacobian, first)
+        gradient = np.add.reduceat(gain @ residual[:, :, None], first)
+        step = np.zeros((len(first), 6))
+        step[:, :free] = -np.linalg.solve(information, gradient)[:, :, 0]
+        turn = exponential(-step[:, :3])
+        translation = np.einsum("kij,kj->ki", turn, state.translation - step[:, 3:])
+        state = replace(state, rotation=turn @ state.rotation, translation=translation)
+    return state

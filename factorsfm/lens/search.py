@@ -1,0 +1,90 @@
+"""Where the estimate of a lens starts: fields of view, with and without distortion, scored by a few frames."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
+from factorsfm.adjustment.observations import Observations
+from factorsfm.adjustment.state import LENS_SIZE, State
+from factorsfm.lens.lens import Lens, renormalized, through
+from factorsfm.support.options import PolishOptions
+
+Array = NDArray[np.float64]
+
+_FIELDS_OF_VIEW = np.radians(np.geomspace(20.0, 100.0, 8))  # across the longer side of what the tracks fill
+_SEARCH_FRAMES, _SEARCH_ITERATIONS, _PARABOLAS = 24, 15, 3
+_SHAPE_POWERS = np.array([2.0, 4.0, -1.0, -1.0, 0.0, 0.0])  # of the focal length in what displaces a pixel as far
+
+
+def search_lens(
+    adjustment: BundleAdjustment, guess: Lens, options: PolishOptions, sigmas: Array | None = None
+) -> tuple[Lens, float]:
+    """The guess, its focal lengths times the factor with which a few frames fit best, and the cost of these.
+
+    Candidates, then parabolas around the best.
+
+    Args:
+        sigmas: (4,) with which the shape is free around the guess; None: it is that of the guess.
+    """
+    state, few = _some_frames(adjustment.state, adjustment.observations)
+    options = replace(options, iterations=_SEARCH_ITERATIONS, tolerance=1e-3)
+    known = np.zeros(LENS_SIZE) if sigmas is None and guess.shape.any() else sigmas
+
+    def fit(near: State, factor: float) -> tuple[float, State]:
+        focal = factor * guess.focal
+        ratio = float(focal[0] / np.exp(near.log_focal[0])) if sigmas is not None else 1.0
+        lens = Lens(focal, near.lens * ratio**_SHAPE_POWERS)  # the same pixels are moved as far
+        seen = renormalized(few, guess, lens, state.group)
+        if not np.isfinite(seen.xy).all():  # some pixels are seen by no ray of this lens
+            return np.inf, near
+        problem = BundleAdjustment(
+            replace(through(near, focal), lens=lens.shape), seen, options,
+            sigma=adjustment.sigma, lens_sigmas=known, lens_mean=guess.shape,
+        )  # fmt: skip
+        problem.solve()
+        return problem.cost(), problem.state
+
+    candidates = np.sort(0.5 * float(np.ptp(few.xy, axis=0).max()) / np.tan(_FIELDS_OF_VIEW / 2))
+    fits = {1.0: fit(replace(state, lens=guess.shape), 1.0)}
+    for side in (candidates[candidates > 1.0], candidates[candidates < 1.0][::-1]):
+        near = fits[1.0][1]
+        for factor in side.tolist():
+            fits[factor] = fit(near, factor)
+            near = fits[factor][1]
+    for _ in range(_PARABOLAS):
+        factors = sorted(fits)
+        best = min(range(len(factors)), key=lambda i: fits[factors[i]][0])
+        around = factors[max(best - 1, 0) : best + 2]
+        costs = [fits[f][0] for f in around]
+        if len(around) < 3 or not np.isfinite(costs).all():
+            break
+        x = np.log(np.array(around) / around[1])
+        curvature, slope, _ = np.polyfit(x, costs, 2)
+        factor = around[1] * float(np.exp(np.clip(-0.5 * slope / curvature, 0.5 * x[0], 0.5 * x[2])))
+        fits[factor] = fit(fits[around[1]][1], factor)
+    factor = min(fits, key=lambda f: fits[f][0])
+    cost, found = fits[factor]
+    return Lens(factor * guess.focal, found.lens), cost
+
+
+def _some_frames(state: State, observations: Observations) -> tuple[State, Observations]:
+    """Few frames, evenly spread, that of the world among them, and the points that two of them see."""
+    count = len(state.rotation)
+    frames = np.unique([*np.linspace(0, count - 1, min(count, _SEARCH_FRAMES)).astype(int), state.world])
+    keep = np.isin(observations.frame, frames)
+    seen = np.bincount(observations.point[keep], minlength=len(state.bearing)) >= 2
+    keep &= seen[observations.point]
+    points = np.flatnonzero(seen)
+    part = replace(
+        state.of(points),
+        rotation=state.rotation[frames],
+        translation=state.translation[frames],
+        group=state.group[frames],
+        world=int(np.searchsorted(frames, state.world)),
+    )
+    frame, point = observations.frame[keep], observations.point[keep]
+    return part, observations.at(keep, frame=np.searchsorted(frames, frame), point=np.searchsorted(points, point))

@@ -1,0 +1,49 @@
+"""Keyframes: which images become one, and how the images after one follow it when the graph moves it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorsfm.mapping.mapped_images import MappedImage
+from factorsfm.support.options import MapperOptions
+from factorsfm.support.rotations import nearest_rotation
+from factorsfm.tracks.image_tracks import ImageTracks, median_flow, shared_tracks
+
+Array = NDArray[np.float64]
+
+_LEAST_SHARED = 0.7  # of the tracks of the last keyframe; with fewer, a new one is made
+
+
+def is_keyframe(
+    image: ImageTracks, last: ImageTracks, count: int, focal: float, width: int, options: MapperOptions
+) -> bool:
+    """Whether an image shows enough beyond the last keyframe.
+
+    Args:
+        count: of the keyframes so far; focal, width: of the images, pixels.
+    """
+    # A young map has the shape that the prior guessed: the first keyframes come soon. Of a camera that hardly moves,
+    # ever fewer are needed.
+    youth = min(1.0, 0.25 * count)
+    interval = min(2 * count, options.keyframe_interval) * max(1, count // 10)
+    return bool(
+        shared_tracks(image, last) < _LEAST_SHARED * len(last.ids)
+        or median_flow(image, last) * focal > youth * options.keyframe_flow * width
+        or image.position - last.position >= interval
+    )
+
+
+def carry(keyframe: MappedImage, before: tuple[Array, Array], followers: Sequence[MappedImage]) -> None:
+    """Move images with a keyframe: they were registered on the map of when it had the pose `before`."""
+    rotation, translation = keyframe.pose
+    for image in followers:
+        if image.registered:
+            turn, shift = image.pose
+            relative = turn @ before[0].T
+            # Rotations that stem from each other are alike in how far they are none: here it would be three times as
+            # far, at every keyframe.
+            image.rotation = nearest_rotation(relative @ rotation)
+            image.translation = relative @ (translation - before[1]) + shift

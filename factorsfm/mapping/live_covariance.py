@@ -1,0 +1,48 @@
+"""How certain a pose is when it is given, long before the shot has shown all that it will."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorsfm.mapping.mapped_images import MappedImage
+from factorsfm.support.rotations import cross_matrices
+
+Array = NDArray[np.float64]
+
+_YOUNG_ERROR = 0.8  # relative, of a map that only the prior has shaped; falls with the square of the keyframes
+_SAME_PLACE = 0.02  # of the camera's displacement: keyframes nearer than that tell no more of the map's shape than one
+
+
+def live_covariance(pose: tuple[Array, Array], on_map: Array, keyframes: Sequence[MappedImage]) -> Array:
+    """(6, 6) of a pose that was just registered (`FrameResult.covariance`).
+
+    Args:
+        pose: rotation (3, 3) and translation (3,), cam_from_world.
+        on_map: (6, 6) what is uncertain where the map is exact.
+        keyframes: those whose covariance the graph has given: what the map itself leaves open.
+    """
+    rotation, translation = pose
+    # What linearised covariances do not know of a young map: that its whole shape is still a guess.
+    places = _places(keyframes, -rotation.T @ translation)
+    bent = _YOUNG_ERROR * float(np.linalg.norm(translation)) / places**2
+    on_map = on_map + bent**2 * np.eye(6)
+    if len(keyframes) < 2:
+        return on_map
+    keyframe = keyframes[-1]
+    assert keyframe.covariance is not None
+    turn = rotation @ keyframe.pose[0].T
+    shift = translation - turn @ keyframe.pose[1]
+    adjoint = np.zeros((6, 6))
+    adjoint[:3, :3] = adjoint[3:, 3:] = turn
+    adjoint[3:, :3] = cross_matrices(shift[None])[0] @ turn
+    return on_map + adjoint @ keyframe.covariance @ adjoint.T
+
+
+def _places(keyframes: Sequence[MappedImage], center: Array) -> int:
+    """From how many places keyframes have seen the scene, on the scale of the move to `center`; at least 1."""
+    centers = np.array([-rotation.T @ translation for rotation, translation in (image.pose for image in keyframes)])
+    steps = np.linalg.norm(np.diff(centers, axis=0), axis=1) if len(centers) > 1 else np.zeros(0)
+    return 1 + int((steps > _SAME_PLACE * np.linalg.norm(center)).sum())

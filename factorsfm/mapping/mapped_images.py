@@ -1,0 +1,72 @@
+"""Images as the mapper sees them: tracks instead of pixels, and what became of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorsfm.adjustment.state import State
+from factorsfm.support.status import FrameStatus
+from factorsfm.tracks.image_tracks import ImageTracks
+
+Array = NDArray[np.float64]
+
+
+@dataclass(slots=True)
+class MappedImage:
+    """An image and what is known of its pose.
+
+    Attributes:
+        inliers: tracks that agree with its pose; threshold: reprojection error up to which they do (pixels).
+        affine: scale and shift of its depth prior beside the map.
+        covariance: (6, 6) of the pose as it was registered, or as the graph has it for a keyframe.
+    """
+
+    tracks: ImageTracks
+    status: FrameStatus
+    message: str
+    rotation: Array | None = None
+    translation: Array | None = None
+    keyframe: bool = False
+    inliers: int = 0
+    threshold: float = 0.0
+    affine: tuple[float, float] | None = None
+    covariance: Array | None = None
+
+    @property
+    def registered(self) -> bool:
+        return self.rotation is not None
+
+    @property
+    def pose(self) -> tuple[Array, Array]:
+        """`cam_from_world` rotation and translation of a registered image."""
+        if self.rotation is None or self.translation is None:
+            raise ValueError(f"image {self.tracks.position} is not registered")
+        return self.rotation, self.translation
+
+    def forget(self, status: FrameStatus, message: str) -> None:
+        """Give up all that is known but the tracks, and the prior at them."""
+        blank = MappedImage(self.tracks, status, message)
+        for field in fields(self):
+            setattr(self, field.name, getattr(blank, field.name))
+
+
+def state_of(images: Sequence[MappedImage], points: Array, focal: float) -> State:
+    """Poses of registered images, and Euclidean points (n, 3), as variables of a bundle adjustment."""
+    distance = np.linalg.norm(points, axis=1)
+    return State(
+        np.array([image.rotation for image in images]),
+        np.array([image.translation for image in images]),
+        points / distance[:, None],
+        1.0 / distance,
+        np.log([focal]),
+    )
+
+
+def renormalize(images: Sequence[MappedImage], ratio: float) -> None:
+    """What was seen with another focal length; `ratio`: the former one over the new one."""
+    for image in images:
+        image.tracks = replace(image.tracks, xy=image.tracks.xy * ratio)

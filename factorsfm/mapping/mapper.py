@@ -1,0 +1,418 @@
+"""The incremental mapper: start, register, triangulate, update the graph; one image at a time, in order of arrival."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorsfm.graph.process import GraphProcess
+from factorsfm.mapping.graph_updates import submit_update
+from factorsfm.mapping.keyframes import carry, is_keyframe
+from factorsfm.mapping.live_covariance import live_covariance
+from factorsfm.mapping.map_registration import NotOnMap, register_by_corners, register_on_map
+from factorsfm.mapping.map_update import YOUNG_KEYFRAMES, MapCopy, MapUpdate, add_tracks
+from factorsfm.mapping.mapped_images import MappedImage, renormalize
+from factorsfm.mapping.point_map import PointMap
+from factorsfm.mapping.registration import Registration
+from factorsfm.mapping.starter import Starter
+from factorsfm.mapping.starts import NoStart, Start
+from factorsfm.priors.image_depth import ImageDepth
+from factorsfm.support.options import Options
+from factorsfm.support.status import FrameStatus
+from factorsfm.tracks.image_tracks import ImageTracks, shared_tracks
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+logger = logging.getLogger(__name__)
+
+_STATE = (
+    "focal", "first_focal", "keyframes", "new_points", "parallax", "started", "without_prior",
+    "_waits_for_depth", "_due", "_mirrored",
+)  # fmt: skip
+_DEPTH_PATIENCE = 3  # keyframes without a depth map after which one does without
+_NOT_JOINED = (FrameStatus.LOST, FrameStatus.TOO_FEW_INLIERS)
+_PATIENCE, _BARELY_STARTED = 5, 2  # images that do not join a map, and its keyframes, with which it is given up
+_MOST_MIRRORED = 3  # updates in a row; then it is the prior that is wrong, not the geometry
+_RUNNING_OUT = 0.5  # share of an image's tracks with a point, below which the map is extended at once
+_SETTLED, _SETTLED_DELAY = 5, 2  # keyframes of a map that changes little; frames that it waits longer for the graph
+_REACH = 60  # images to both sides of a lost one from which its tracks are triangulated
+
+
+class Mapper:
+    """Depth-guided incremental structure from motion over tracks.
+
+    Args:
+        graph: that of the keyframes, closed with the mapper.
+        focal: pixels; width: of the image, pixels.
+        options: steps, thresholds and weights.
+        has_prior: whether a depth prior exists at all; without one the start is the essential matrix.
+    """
+
+    def __init__(self, graph: GraphProcess, focal: float, width: int, options: Options, *, has_prior: bool) -> None:
+        self.options = options.mapper
+        self.focal, self.first_focal = focal, focal
+        self.width = width
+        self._refine_focal = options.refine_focal_length
+        self.images: list[MappedImage] = []
+        self.keyframes: list[int] = []
+        self.burn_ins = np.zeros(0, np.int64)  # tracks that the last image showed to be laid over the image
+        self.new_points = 0  # that came with the last image
+        self.parallax = 0.0  # largest so far
+        self.note = ""  # what became of the map with the last image, where that is out of the ordinary
+        self.starts_anew = False  # whether the map was given up with the last image
+        self.without_prior = ""  # why the depth prior takes no part any more
+        self._graph = graph
+        self._update: Future[MapUpdate] | None = None
+        self._due = 0
+        self._advanced = -1  # number of images for which `advance` was called last
+        self._starter = Starter(self.options, has_prior=has_prior)
+        self._reads_every_depth = has_prior and (
+            self._starter.kind == "pair" or self.options.registration_depth != "none"
+        )
+        self._uses_keyframe_depth = has_prior and options.uses_depth
+        self.started = False
+        self.points = PointMap()
+        self._waits_for_depth = 0
+        self._mirrored = 0  # updates in a row that were rolled back as mirrored
+
+    # --- snapshots ----------------------------------------------------------------------------------------------
+
+    def state(self) -> dict[str, Any]:
+        """Everything that `restore` needs; waits for what the graph is working on."""
+        update = self._update.result() if self._update is not None else None
+        return {
+            **{name: getattr(self, name) for name in _STATE},
+            "start_kind": self._starter.kind,
+            "images": list(self.images),
+            "points": self.points.table,
+            "update": update,
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go on where `state` was taken. The graph is rebuilt from the map at its next update."""
+        for name in _STATE:
+            setattr(self, name, state[name])
+        self._starter.kind = state["start_kind"]
+        self.images = list(state["images"])
+        self.points = PointMap(state["points"])
+        if state["update"] is not None:
+            self._update = Future()
+            self._update.set_result(state["update"])
+
+    # --- the algorithm ------------------------------------------------------------------------------------------
+
+    def add(self, tracks: ImageTracks, read_depth: Callable[[], ImageDepth | None]) -> MappedImage:
+        """Take the next image: register it on the map, and extend the map where it shows something new.
+
+        Args:
+            read_depth: gives the prior at the image's keypoints; called only if it is needed.
+        """
+        if self._reads_every_depth:
+            tracks = replace(tracks, depth=read_depth())
+        self.advance()
+        image = MappedImage(tracks, FrameStatus.WAITING, "waiting for the start of the map")
+        self.images.append(image)
+        try:
+            self._process(image, read_depth)
+        except Exception:  # a prior that fails, before anything changed: the image was never here
+            self.images.pop()
+            raise
+        return image
+
+    def advance(self) -> None:
+        """Before the next image: take over what the graph has made of a keyframe, if that is due."""
+        if self._advanced == len(self.images):
+            return
+        self._advanced = len(self.images)
+        self.burn_ins = np.zeros(0, np.int64)
+        self.new_points = 0
+        self.note, self.starts_anew = "", False
+        if self._update is not None and len(self.images) >= self._due:
+            self._take_over()
+
+    def _process(self, image: MappedImage, read_depth: Callable[[], ImageDepth | None]) -> None:
+        if len(image.tracks.ids) < self.options.min_tracks:
+            image.status = FrameStatus.TOO_FEW_TRACKS
+            image.message = f"{len(image.tracks.ids)} of {self.options.min_tracks} needed tracks"
+        elif not self.started:
+            self._try_start(read_depth)
+        else:
+            self._extend(image, read_depth)
+            if not image.registered and self._passed_by():
+                self._start_anew()
+                self._try_start(read_depth)
+
+    def _extend(self, image: MappedImage, read_depth: Callable[[], ImageDepth | None]) -> None:
+        """Register an image, and extend the map where it shows something new."""
+        hurry = self.points.contains(image.tracks.ids).mean() < _RUNNING_OUT
+        if hurry:  # the camera is faster than the graph
+            self._take_over()
+        if not self.started:
+            self._try_start(read_depth)
+            return
+        self._register(image)
+        if not image.registered and self._map_tracks(image):
+            self._register(image)
+        if image.registered and self._update is None and self._is_keyframe(image):
+            self._add_keyframe(image, read_depth)
+            if hurry:
+                self._take_over()
+
+    def finish(self) -> None:
+        """No more images: start with what there is, if nothing better came; all images on the map as it is at last."""
+        self._take_over()
+        if not self.started:
+            self._begin(self._starter.last_resort(self._waiting(), self.focal))
+        self.refresh()
+        self._take_up_lost()
+        self.close()
+
+    def close(self) -> None:
+        """Let the graph go; what it is working on is lost."""
+        self._graph.close()
+
+    def refresh(self) -> None:
+        """Register the images between the keyframes once more, on the map as it is now."""
+        self._take_over()
+        for image in self.images:
+            if image.registered and not image.keyframe:
+                known = image.status, image.message
+                self._register(image)
+                if image.status is not FrameStatus.REGISTERED:
+                    image.status, image.message = known
+
+    def _take_up_lost(self) -> None:
+        """Register what the map had lost, or not reached yet, from its ends and gaps on: backwards, then forwards."""
+        if not self.started:
+            return
+        found = True
+        while found:
+            found = False
+            for image in itertools.chain(reversed(self.images), self.images):
+                if image.registered or image.status not in _NOT_JOINED:
+                    continue
+                known = image.status, image.message
+                self._map_tracks(image)
+                self._register(image)
+                if image.registered:
+                    found = True
+                else:
+                    image.status, image.message = known
+
+    def _map_tracks(self, image: MappedImage) -> bool:
+        """Points for the tracks that an image without a pose shares with registered ones; whether there are any."""
+        position = image.tracks.position
+        around = self.images[max(0, position - _REACH) : position + _REACH + 1]
+        registered = [other for other in around if other.registered]
+        if not registered:
+            return False
+        near = min(registered, key=lambda other: abs(other.tracks.position - position))
+        shared = np.intersect1d(near.tracks.ids, image.tracks.ids, assume_unique=True)
+        return add_tracks(self.points, registered, near, shared, self.options, self.focal) > 0
+
+    # --- start --------------------------------------------------------------------------------------------------
+
+    def _waiting(self) -> list[MappedImage]:
+        return [image for image in self.images if image.status is FrameStatus.WAITING]
+
+    def _try_start(self, read_depth: Callable[[], ImageDepth | None]) -> None:
+        self._begin(self._starter.try_start(self._waiting(), self.focal, read_depth))
+
+    def _begin(self, start: Start | NoStart) -> None:
+        if isinstance(start, NoStart):
+            for image in self._waiting():
+                image.message = start.reason
+            return
+        self.started = True
+        self.points.set(start.ids, start.points)
+        self.new_points = len(start.ids)
+        waiting = self._waiting()
+        for position, rotation, translation in zip(start.images, start.rotation, start.translation, strict=True):
+            image = next(i for i in waiting if i.tracks.position == position)
+            inliers = np.isin(image.tracks.ids, start.ids)
+            known = Registration(rotation, translation, inliers, 0.0, self.options.inlier_px, np.zeros((6, 6)))
+            self._accept(image, known)
+            self._add_keyframe(image, None)
+            self._take_over()
+        if len(start.images) == 1:
+            image.message = f"the start of a map of {len(start.ids)} points, which no other image has joined yet"
+        # Next image as COLMAP chooses it: the one that sees most of the map.
+        remaining = [image for image in waiting if not image.registered]
+        while remaining and self.started:
+            image = max(remaining, key=lambda i: int(self.points.contains(i.tracks.ids).sum()))
+            remaining.remove(image)
+            self._register(image)
+            if image.registered and self._is_keyframe(image):
+                self._add_keyframe(image, None)
+                self._take_over()
+
+    def _passed_by(self) -> bool:
+        """Whether more images have failed to join the map than ever joined it, and show one thing themselves.
+
+        The map is of a flash then, or of the end of the shot before. One that has grown is never given up.
+        """
+        joined = sum(image.registered for image in self.images)
+        since = itertools.takewhile(lambda image: not image.registered, reversed(self.images))
+        failed = [image.tracks for image in since if image.status in _NOT_JOINED]
+        if len(self.keyframes) > _BARELY_STARTED or len(failed) <= max(_PATIENCE, joined):
+            return False
+        return shared_tracks(failed[0], failed[_PATIENCE]) >= self.options.min_tracks
+
+    def _start_anew(self) -> None:
+        """Forget the map; the images that did not join it wait for another."""
+        self._take_over()
+        joined = sum(image.registered for image in self.images)
+        last = max(k for k, image in enumerate(self.images) if image.registered)
+        for k, image in enumerate(self.images):
+            if k > last and image.status in _NOT_JOINED:
+                image.forget(FrameStatus.WAITING, "waiting for the start of another map")
+            elif image.registered:
+                image.forget(FrameStatus.LOST, f"on a map of {joined} images that none of those that followed joined")
+        self._give_up_map(f"the images that follow image {last} do not join its map, starting anew")
+
+    def _give_up_map(self, reason: str) -> None:
+        self._graph.start_anew()
+        self.points, self.keyframes, self.parallax, self.started = PointMap(), [], 0.0, False
+        self.starts_anew, self.note = True, reason
+        logger.warning(reason)
+
+    # --- registration -------------------------------------------------------------------------------------------
+
+    def _register(self, image: MappedImage) -> None:
+        near = image if image.registered else self._nearest_registered(image.tracks.position)
+        found = register_on_map(image, self.points, near, self.focal, self.options)
+        if isinstance(found, NotOnMap):
+            image.status, image.message = found.status, found.message
+        else:
+            self._accept(image, found)
+
+    def relocalize(self, image: MappedImage, ids: Index, xy: Array) -> bool:
+        """Register an image by what its descriptors say that it shows; whether that worked.
+
+        Args:
+            ids: (n,) tracks that look like corners of the image; xy: (n, 2) these corners, normalised.
+        """
+        near = self._nearest_registered(image.tracks.position)
+        result, agree = register_by_corners(ids, xy, self.points, near, self.focal, self.options)
+        if result is None:
+            image.message += f"; not found again: {agree}" if agree else ""
+            return False
+        self._accept(image, replace(result, inliers=np.zeros(len(image.tracks.ids), bool)))
+        image.inliers = int(result.inliers.sum())
+        image.message = f"found again: {agree}"
+        return True
+
+    def _nearest_registered(self, position: int) -> MappedImage:
+        for offset in range(1, len(self.images)):
+            for other in (position - offset, position + offset):
+                if 0 <= other < len(self.images) and self.images[other].registered:
+                    return self.images[other]
+        raise ValueError("no image is registered")
+
+    def _accept(self, image: MappedImage, result: Registration) -> None:
+        image.rotation, image.translation = result.rotation, result.translation
+        image.inliers, image.threshold = int(result.inliers.sum()), result.threshold
+        image.status = FrameStatus.REGISTERED
+        image.message = f"{image.inliers} inliers within {result.threshold:.1f} pixels"
+        if result.affine is not None:
+            image.affine = result.affine
+        solved = [self.images[k] for k in self.keyframes if self.images[k].covariance is not None]
+        image.covariance = live_covariance(image.pose, result.covariance, solved)
+        inverse = self.points.inverse_depths(image, result.inliers)
+        if len(inverse):  # the first camera is the world
+            moved = float(np.linalg.norm(result.translation))
+            self.parallax = max(self.parallax, moved * float(np.median(inverse)))
+
+    # --- keyframes and landmarks --------------------------------------------------------------------------------
+
+    def _is_keyframe(self, image: MappedImage) -> bool:
+        last = self.images[self.keyframes[-1]].tracks
+        return is_keyframe(image.tracks, last, len(self.keyframes), self.focal, self.width, self.options)
+
+    def _add_keyframe(self, image: MappedImage, read_depth: Callable[[], ImageDepth | None] | None) -> None:
+        """Let the graph work on the keyframe; the map takes over its result after `graph_delay` frames."""
+        keyframes = [replace(self.images[k]) for k in self.keyframes] + [replace(image)]
+        copy = MapCopy(keyframes, self.points.copy(), self.options, self.focal, self._refine_focal)
+        if self.without_prior:
+            copy = copy.without_prior()
+        read = read_depth if self._guided else None
+        self._update = submit_update(self._graph, copy, read)
+        image.keyframe = True
+        settled = _SETTLED_DELAY if len(self.keyframes) >= _SETTLED else 0
+        self._due = len(self.images) - 1 + self.options.graph_delay + settled
+
+    def _take_over(self) -> None:
+        """Wait for the graph, and take over the map as it sees it now."""
+        if self._update is None:
+            return
+        pending, self._update = self._update, None
+        update = pending.result()
+        image = self.images[update.position]
+        if image.tracks.depth is None and update.depth is not None:
+            image.tracks = replace(image.tracks, depth=update.depth)
+        self._doubt_prior(update)
+        if not self.started:
+            return
+        missing = self._guided and update.depth is None
+        if missing and self.keyframes and self._waits_for_depth < _DEPTH_PATIENCE:
+            self._waits_for_depth += 1  # another image may have a map
+            image.keyframe = False
+            return
+        self._waits_for_depth = 0
+        if not update.committed:
+            image.keyframe = False
+            return
+        self.keyframes.append(update.position)
+        before = image.pose
+        self.new_points += int((~self.points.contains(update.ids)).sum())
+        self.points.set(update.ids, update.points)
+        self.points.remove(update.removed)
+        for position, pose in update.poses.items():
+            self.images[position].rotation, self.images[position].translation = pose
+        for position, covariance in update.covariances.items():
+            self.images[position].covariance = covariance
+        for position, affine in update.affines.items():
+            self.images[position].affine = affine
+        self.burn_ins = np.union1d(self.burn_ins, update.burn_ins)
+        carry(image, before, self.images[update.position + 1 :])
+        if update.focal is not None:
+            self._set_focal(update.focal)
+
+    @property
+    def _guided(self) -> bool:
+        """Whether the depth prior takes part in the updates of the map."""
+        return self._uses_keyframe_depth and not self.without_prior
+
+    def _doubt_prior(self, update: MapUpdate) -> None:
+        """Go on without the prior where it is none: it contradicts itself, or again and again the geometry.
+
+        A young map has the shape that it said, and so it is given up.
+        """
+        self._mirrored = self._mirrored + 1 if update.mirrored else 0
+        reason = update.reason if update.no_prior else ""
+        if self._mirrored >= _MOST_MIRRORED:
+            reason = f"the geometry is its mirror image in {self._mirrored} updates in a row"
+        if not reason or not self._guided:
+            return
+        self.without_prior, self._starter.kind = reason, "essential"
+        self.note = f"going on without the depth prior: {reason}"
+        if len(self.keyframes) > YOUNG_KEYFRAMES:
+            logger.warning(self.note)
+            return
+        for image in self.images:
+            if image.registered or image.status in _NOT_JOINED:
+                image.forget(FrameStatus.WAITING, "waiting for a start without the depth prior")
+        self._give_up_map(f"{self.note}; starting anew")
+
+    def _set_focal(self, focal: float) -> None:
+        """Normalise all that was seen with another focal length."""
+        renormalize(self.images, self.focal / focal)
+        self.focal = focal

@@ -1,0 +1,73 @@
+"""When and how the map of a video starts: lifted by the prior, from the paper's pair, or without depth."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from factorsfm.mapping.mapped_images import MappedImage
+from factorsfm.mapping.starts import NoStart, Start, start_essential_among, start_flat, start_lifted, start_pair
+from factorsfm.priors.image_depth import ImageDepth
+from factorsfm.support.options import MapperOptions
+from factorsfm.tracks.image_tracks import ImageTracks
+
+logger = logging.getLogger(__name__)
+
+_PAIR_WINDOW = 10  # images among which the paper's initial pair is sought
+_LIFT_PATIENCE = 10  # images without a usable depth map after which the start does without
+
+
+class Starter:
+    """The start that the options ask for, or the one that is possible.
+
+    Attributes:
+        kind: see `MapperOptions.initialization`; "essential" where there is no prior.
+    """
+
+    def __init__(self, options: MapperOptions, *, has_prior: bool) -> None:
+        self._options = options
+        self.kind: str = options.initialization if has_prior else "essential"
+
+    def try_start(
+        self, waiting: Sequence[MappedImage], focal: float, read_depth: Callable[[], ImageDepth | None]
+    ) -> Start | NoStart:
+        """A start from the images that wait for one, the newest last.
+
+        Args:
+            focal: pixels.
+            read_depth: gives the prior at the keypoints of the newest; called only if it is needed.
+        """
+        newest = waiting[-1]
+        if self.kind == "lifted":
+            newest.tracks = replace(newest.tracks, depth=read_depth())
+            start = start_lifted(newest.tracks, self._options.min_tracks)
+            if isinstance(start, NoStart) and len(waiting) >= _LIFT_PATIENCE:
+                logger.warning("no usable depth in %d images, starting without: %s", _LIFT_PATIENCE, start.reason)
+                self.kind = "essential"
+            return start
+        if self.kind == "pair":
+            if len(waiting) < _PAIR_WINDOW:
+                return NoStart(f"{len(waiting)} of {_PAIR_WINDOW} images among which the start is chosen")
+            return self._pair(_tracks(waiting), focal)
+        return self._essential(_tracks(waiting), focal, self._options.essential_angle_deg)
+
+    def last_resort(self, waiting: Sequence[MappedImage], focal: float) -> Start | NoStart:
+        """Where no more images come: with little parallax, or with none, rather than not at all."""
+        tracks = _tracks(waiting)
+        start = self._pair(tracks, focal) if self.kind == "pair" else NoStart("")
+        if isinstance(start, NoStart):
+            start = self._essential(tracks, focal, 0.0)
+        return start_flat(tracks) if isinstance(start, NoStart) else start
+
+    def _pair(self, tracks: list[ImageTracks], focal: float) -> Start | NoStart:
+        o = self._options
+        return start_pair(tracks, o.min_tracks, focal=focal, sigma=o.pixel_sigma, inlier_px=o.inlier_px)
+
+    def _essential(self, tracks: list[ImageTracks], focal: float, angle_deg: float) -> Start | NoStart:
+        o = self._options
+        return start_essential_among(tracks, o.min_tracks, focal=focal, sigma=o.pixel_sigma, angle_deg=angle_deg)
+
+
+def _tracks(images: Sequence[MappedImage]) -> list[ImageTracks]:
+    return [image.tracks for image in images]

@@ -1,0 +1,124 @@
+"""Triangulation of many tracks at once: two-view DLT hypotheses, RANSAC over the views, refinement of the points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
+from factorsfm.adjustment.observations import Observations, PriorObservations
+from factorsfm.adjustment.residuals import camera_points, reprojection
+from factorsfm.adjustment.state import State
+from factorsfm.support.options import PolishOptions
+
+Array = NDArray[np.float64]
+
+_TRIALS = 6
+
+
+@dataclass(frozen=True, slots=True)
+class Triangulation:
+    """Points of tracks.
+
+    Attributes:
+        bearing (n, 3) unit and inverse_distance (n,): the points, as in `refinement.State`.
+        inliers: (n,) views that agree with the point.
+        angle: (n,) largest angle between its rays (radians).
+    """
+
+    bearing: Array
+    inverse_distance: Array
+    inliers: NDArray[np.int64]
+    angle: Array
+
+
+def triangulate(
+    rotation: Array,
+    translation: Array,
+    observations: Observations,
+    *,
+    focal: float,
+    inlier_px: float,
+    sigma: float,
+    fallback: Array,
+    affine: Array | None = None,
+    prior: PriorObservations | None = None,
+    seed: int = 0,
+) -> Triangulation:
+    """DLT in RANSAC, then ``min over P of sum E_PR + lambda E_DC`` with cameras and affines fixed (paper, 3.3).
+
+    Args:
+        rotation (k, 3, 3), translation (k, 3): `cam_from_world` of the views.
+        observations: sorted by point; every point has at least one.
+        fallback: (n,) inverse distance along the first ray where the views leave it open (small angle).
+        affine, prior: (images, 2) scale and shift, and the values they scale; None without a prior.
+        focal, inlier_px, sigma: pixels.
+    """
+    o = observations
+    start = o.first
+    n = len(start)
+    count = np.diff(np.append(start, len(o.point)))
+    rays = np.concatenate([o.xy, np.ones((len(o.xy), 1))], 1)
+    rays = np.einsum("nji,nj->ni", rotation[o.frame], rays)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    first = rays[start]
+    center = -np.einsum("nji,nj->ni", rotation[o.frame[start]], translation[o.frame[start]])
+    angle = np.maximum.reduceat(np.linalg.norm(np.cross(rays, first[o.point]), axis=1), start)
+    guess = _homogeneous(first + fallback[:, None] * center, fallback)
+    hypotheses = [guess]
+    rng = np.random.default_rng(seed)
+    for trial in range(_TRIALS):
+        a = start if trial == 0 else start + rng.integers(0, count)
+        b = start + count - 1 if trial == 0 else start + rng.integers(0, count)
+        hypotheses.append(_two_view(rotation, translation, o, a, b))
+    stacked = np.stack(hypotheses)
+    support = np.stack([_support(rotation, translation, o, h, focal, inlier_px) for h in stacked])
+    inliers = np.stack([np.add.reduceat((s < inlier_px).astype(np.int64), start) for s in support])
+    robust = np.stack([np.add.reduceat(np.minimum(s, inlier_px), start) for s in support])
+    best = np.argmin(robust, axis=0)
+    chosen = stacked[best, np.arange(n)]
+    distance = np.linalg.norm(chosen[:, :3], axis=1)
+    state = State(
+        rotation,
+        translation,
+        chosen[:, :3] / distance[:, None],
+        chosen[:, 3] / distance,
+        np.log([focal]),
+    )
+    if affine is not None:
+        state = replace(state, scale=affine[:, 0], shift=affine[:, 1], field=np.zeros(1))
+    options = replace(PolishOptions(), iterations=8)
+    state = BundleAdjustment(state, o, options, sigma=sigma, prior=prior, points_only=True).solve()
+    error = _support(rotation, translation, o, np.c_[state.bearing, state.inverse_distance], focal, inlier_px)
+    inliers = np.add.reduceat((error < inlier_px).astype(np.int64), start)
+    return Triangulation(state.bearing, state.inverse_distance, inliers, angle)
+
+
+def _homogeneous(direction: Array, inverse_distance: Array) -> Array:
+    return np.concatenate([direction, inverse_distance[:, None]], 1)
+
+
+def _two_view(
+    rotation: Array, translation: Array, o: Observations, a: NDArray[np.int64], b: NDArray[np.int64]
+) -> Array:
+    """(n, 4) homogeneous DLT points of one pair of observations per point, in front of the first camera."""
+    camera = np.concatenate([rotation, translation[:, :, None]], 2)
+    rows = []
+    for side in (a, b):
+        p = camera[o.frame[side]]
+        rows += [o.xy[side, :1] * p[:, 2] - p[:, 0], o.xy[side, 1:] * p[:, 2] - p[:, 1]]
+    point = np.linalg.svd(np.stack(rows, 1))[2][:, 3]
+    depth = np.einsum("ni,ni->n", camera[o.frame[a], 2], point)
+    # A homogeneous point and its negative are the same: choose the one in front, at positive or negative distance.
+    return np.where(depth[:, None] < 0.0, -point, point)
+
+
+def _support(rotation: Array, translation: Array, o: Observations, points: Array, focal: float, limit: float) -> Array:
+    """(m,) reprojection errors (pixels) of homogeneous points; beyond infinity or behind the camera counts as miss."""
+    q = camera_points(rotation[o.frame], translation[o.frame], points[o.point, :3], points[o.point, 3])
+    front = (q[:, 2] > 1e-9) & (points[o.point, 3] > 0.0)
+    error = np.full(len(q), 10.0 * limit)
+    error[front] = np.linalg.norm(reprojection(q[front], focal * o.xy[front], focal)[0], axis=1)
+    return error

@@ -1,0 +1,45 @@
+"""Which frames hold each other: those that enough observations join to the others."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorsfm.adjustment.observations import Observations
+
+Index = NDArray[np.int64]
+
+
+def connected_frames(observations: Observations, frames: int, least: int) -> tuple[NDArray[np.bool_], Index]:
+    """The largest set of frames in which each observes at least so many points that others of the set observe, too.
+
+    Nothing says where the camera of another frame is, relative to these.
+
+    Args:
+        frames: how many there are.
+
+    Returns:
+        (frames,) whether each belongs to the set; (frames,) how many of the set's points it observes.
+    """
+    count = np.bincount(observations.frame, minlength=frames)
+    largest, shared = np.zeros(frames, bool), np.zeros_like(count)
+    left = np.ones(frames, bool)
+    while left.sum() > max(1, largest.sum()):
+        first = int(np.argmax(np.where(left, count, -1)))
+        part, seen = _grown(observations, np.arange(frames) == first, least)
+        if part.sum() > max(1, largest.sum()):
+            largest, shared = part, seen
+        left &= ~part
+    return largest, shared
+
+
+def _grown(o: Observations, part: NDArray[np.bool_], least: int) -> tuple[NDArray[np.bool_], Index]:
+    """As `connected_frames`, the set to which these frames belong: registered one after another on what it observes."""
+    while True:
+        known = np.zeros(int(o.point.max(initial=-1)) + 1, bool)
+        known[o.point[part[o.frame]]] = True
+        seen = np.bincount(o.frame[known[o.point]], minlength=len(part))
+        grown = part | (seen >= least)
+        if (grown == part).all():
+            return part, seen
+        part = grown

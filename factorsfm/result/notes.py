@@ -1,0 +1,154 @@
+"""What a user should read of a result, in sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import astuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorsfm.control.fit import ControlFit
+from factorsfm.lens.lens import LensEstimate
+from factorsfm.polish.polish import Polished
+from factorsfm.result.reconstruction import FrameResult, RollingShutter
+from factorsfm.support.status import ShotKind
+
+# Worth a sentence: the prior gives at least half of the information, or a virtual object may visibly drift.
+_NOTED_SHARE = 0.5
+_NOTED_SLIDE_PX = 0.5
+_MERGED_GAP = 5  # registered frames between two weak stretches that are told as one
+_SHORTEST_STRETCH = 3  # frames
+_MOST_STRETCHES = 2  # sentences of each sort
+
+
+def notes_on(polished: Polished, has_depth: bool) -> list[str]:
+    notes: list[str] = []
+    motion = polished.motion
+    depths = "depths and their scale come from the prior alone" if has_depth else "depths are unknown without a prior"
+    if motion.kind is ShotKind.STATIC:
+        notes.append(
+            f"The camera is static: no frame moves by more than {motion.displacement_px:.2f} pixels; {depths}."
+        )
+    elif motion.kind is ShotKind.ROTATION:
+        notes.append(
+            "The camera only rotates: its translation is not observable from geometry and is reported as zero; "
+            f"{depths}."
+        )
+    if polished.lens is not None:
+        notes.append(lens_note(polished.lens))
+    if polished.control is not None:
+        notes += control_notes(polished.control)
+    if polished.control_unused:
+        notes.append("Control: not used, since a camera that stays in its place ties no lengths to the images.")
+    return notes
+
+
+def lens_note(estimate: LensEstimate) -> str:
+    focals, std = estimate.lens.focal, f"standard deviation {100 * estimate.focal_std.max():.1f} %"
+    focal, zoom, held = float(np.median(focals)), "", not estimate.focal_std.any()
+    if estimate.zoom_std is not None and len(focals) == 1:
+        zoom = f" No zoom was found: what it might be is less than {200 * estimate.zoom_std:.1f} %."
+    elif estimate.zoom_std is not None:
+        zoom = (
+            f" It changes from {focals[0]:.0f} to {focals[-1]:.0f} pixels; the ratio of the longest to the shortest is "
+            f"{focals.max() / focals.min():.3f} ± {estimate.zoom_std * focals.max() / focals.min():.3f}."
+        )
+    if not (estimate.determined or estimate.rough):
+        reason = f"this shot does not determine it ({std})"
+        if estimate.misfit_px:
+            reason = f"the tracks fit no lens (typical error {estimate.misfit_px:.2f} pixels)"
+        kept = "as it was given" if held else f"a guess ({focal:.0f} pixels)"
+        return f"The focal length is {kept}: {reason}.{zoom}"
+    note = "The focal length was estimated"
+    if estimate.rough:
+        note = "The focal length is known roughly, and counts as not determined"
+    note = "The focal length is as it was given" if held else f"{note}: {focal:.0f} pixels, {std}"
+    if np.isfinite(estimate.shape_std[0]):
+        k, k_std = estimate.lens.shape, estimate.shape_std
+        note += f"; radial distortion k1 {k[0]:.3f} ± {k_std[0]:.3f}, k2 {k[1]:.3f} ± {k_std[1]:.3f}"
+    elif held:
+        note += "; no distortion was found"
+    return f"{note}.{zoom}"
+
+
+def shutter_note(shutter: RollingShutter, timestamps: Sequence[float | None]) -> str:
+    way = ("top", "bottom") if shutter.along == "rows" else ("left", "right")
+    first, last = way if shutter.readout > 0 else way[::-1]
+    times = [time for time in timestamps if time is not None]
+    interval = float(np.median(np.diff(times))) if len(times) == len(timestamps) else 0.0
+    milliseconds = f" ({1e3 * abs(shutter.readout) * interval:.1f} ms)" if interval > 0 else ""
+    poses = "are those of the image's middle"
+    if shutter.recorded:
+        poses = "fit the recorded images, with --shutter rolling they are those of the image's middle"
+    return (
+        f"Rolling shutter: images are read from {first} to {last} in {abs(shutter.readout):.2f} ± "
+        f"{shutter.std:.2f} of the time between two frames{milliseconds}. Lens and points are free of it; "
+        f"poses {poses}."
+    )
+
+
+def control_notes(fit: ControlFit) -> list[str]:
+    """What a user should know of it."""
+    wrong = [r for r in fit.residuals if r.contradicts]
+    good = [r.sigmas for r in fit.residuals if not r.contradicts]
+    size = f", off by {np.sqrt(np.mean(np.square(good))):.2g} sigma (root mean square)" if good else ""
+    held = f"{len(fit.held)} poses held exactly, " if fit.held else ""
+    world = "The result is in the control's world." if fit.placed else "The world is that of the first camera."
+    notes = [
+        f"Control: {held}{len(good)} items used{size}; the scale is known to {100 * fit.scale_std:.2g} %, the position "
+        f"of a camera to {fit.position_std:.2g} m. {world}"
+    ]
+    if wrong:
+        worst = sorted(wrong, key=lambda r: -r.sigmas)[:3]
+        said = "; ".join(f"{r.name} by {r.error:.3g} {r.unit} or {r.sigmas:.0f} sigma" for r in worst)
+        notes.append(f"{len(wrong)} items of the control contradict the images and the other items: {said}.")
+    if fit.unused:
+        notes.append(f"Not used of the control: {'; '.join(fit.unused[:3])}.")
+    return notes
+
+
+def observability_notes(frames: Sequence[FrameResult]) -> list[str]:
+    """What a user should know of the prior's share and of the drift: one sentence on the shot, few on stretches.
+
+    Args:
+        frames: of the source, in order; only those that are registered count.
+    """
+    seen = [(f.index, f.observability) for f in frames if f.observability is not None]
+    if not seen:
+        return []
+    index = np.array([i for i, _ in seen])
+    share, view_axis, angle, slide = np.array([astuple(o) for _, o in seen]).T
+    notes = []
+    weak = np.nan_to_num(view_axis) >= _NOTED_SHARE
+    if (typical := float(np.median(np.nan_to_num(share)))) >= _NOTED_SHARE:
+        notes.append(
+            f"{100 * typical:.0f} % of the information on the camera's positions comes from the depth prior: the "
+            f"median triangulation angle is {np.median(angle):.2g} degrees, and the tracks alone would leave "
+            f"{(1.0 - min(typical, 0.9999)) ** -0.5:.2g} times the error."
+        )
+        weak &= not weak.all()
+    for stretch in _stretches(weak, view_axis):
+        notes.append(
+            f"{_frames(index[stretch])}: translation along the view axis comes "
+            f"{100 * np.median(view_axis[stretch]):.0f} % from the depth prior."
+        )
+    for stretch in _stretches(slide >= _NOTED_SLIDE_PX, slide):
+        notes.append(
+            f"{_frames(index[stretch])}: a virtual object at the scene's median depth may drift by "
+            f"{slide[stretch].max():.1f} pixels (one standard deviation)."
+        )
+    return notes
+
+
+def _stretches(weak: NDArray[np.bool_], values: NDArray[np.float64]) -> list[slice]:
+    """The few runs of weak frames with the largest values, in order; runs with a short gap between are one."""
+    rows = np.nonzero(weak)[0]
+    runs = np.split(rows, np.nonzero(np.diff(rows) > _MERGED_GAP + 1)[0] + 1)
+    stretches = [slice(run[0], run[-1] + 1) for run in runs if len(run) >= min(_SHORTEST_STRETCH, len(weak))]
+    stretches.sort(key=lambda stretch: -np.median(values[stretch]))
+    return sorted(stretches[:_MOST_STRETCHES], key=lambda stretch: stretch.start)
+
+
+def _frames(index: NDArray[np.int64]) -> str:
+    return f"Frames {index[0]} to {index[-1]}"

@@ -1,0 +1,154 @@
+"""A result in numbers: what summary.json holds and the report shows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from factorsfm.camera.files import camera_to_json
+from factorsfm.result.reconstruction import FrameResult, Reconstruction
+from factorsfm.support.program import PROGRAM, program_version
+from factorsfm.support.status import ShotKind
+
+
+def summary(reconstruction: Reconstruction) -> dict[str, Any]:
+    """Everything in numbers; NaN where a value does not exist (`json_text` turns it into null)."""
+    return {
+        "program": PROGRAM,
+        "version": program_version(),
+        "reconstructed": True,
+        "verdict": verdict(reconstruction),
+        "source": reconstruction.options.get("source"),
+        "frames": len(reconstruction.frames),
+        "registered": len(reconstruction.registered),
+        "keyframes": sum(frame.keyframe for frame in reconstruction.frames),
+        "points": len(reconstruction.points),
+        "observations": len(reconstruction.observation_point),
+        "parallax": reconstruction.parallax,
+        "kind": reconstruction.kind,
+        "metric": reconstruction.metric,
+        "control": reconstruction.control and asdict(reconstruction.control),
+        "reprojection_error": median_reprojection_error(reconstruction),
+        "observability": pooled_observability(reconstruction),
+        "focal_length": reconstruction.camera.mean_focal_length(),
+        "focal_range": focal_range(reconstruction),
+        "camera": camera_to_json(reconstruction.camera),
+        "lens": reconstruction.lens and asdict(reconstruction.lens),
+        "shutter": reconstruction.shutter and asdict(reconstruction.shutter),
+        "seconds": with_total(reconstruction.seconds),
+        "notes": reconstruction.notes,
+        "parts": 1 + len(reconstruction.others),
+        "statuses": [_frame_json(frame) for frame in reconstruction.frames],
+        "options": reconstruction.options,
+    }
+
+
+def failure_summary(
+    reason: str, frames: Sequence[FrameResult], options: Mapping[str, Any], seconds: Mapping[str, float]
+) -> dict[str, Any]:
+    """The summary of a shot that cannot be reconstructed."""
+    return {
+        "program": PROGRAM,
+        "version": program_version(),
+        "reconstructed": False,
+        "reason": reason,
+        "source": options.get("source"),
+        "frames": len(frames),
+        "registered": sum(frame.registered for frame in frames),
+        "seconds": with_total(seconds),
+        "statuses": [_frame_json(frame) for frame in frames],
+        "options": options,
+    }
+
+
+def verdict(reconstruction: Reconstruction) -> str:
+    """What has been recovered, in one sentence for the user."""
+    sentence = f"{registered_share(reconstruction)} registered, {len(reconstruction.points):,} points"
+    error = median_reprojection_error(reconstruction)
+    if math.isfinite(error):
+        sentence += f", median reprojection error {error:.2f} px"
+    if reconstruction.kind is ShotKind.GENERAL:
+        return f"{sentence}, parallax {reconstruction.parallax:.3f}"
+    motion = "pure rotation" if reconstruction.kind is ShotKind.ROTATION else "static camera"
+    return f"{sentence}; {motion}, no parallax"
+
+
+def part_name(number: int) -> str:
+    """Folder, in that of the first part, of the result of another part of an image set; counted from 1."""
+    return f"part-{number:03d}"
+
+
+def registered_share(reconstruction: Reconstruction) -> str:
+    """All frames, or so many of them."""
+    frames, registered = len(reconstruction.frames), len(reconstruction.registered)
+    return f"all {frames} frames" if registered == frames else f"{registered} of {frames} frames"
+
+
+def conclusion(reconstruction: Reconstruction, output: Path) -> str:
+    """What to say of a result that has been written."""
+    notes = [f"Note: {note}" for note in reconstruction.notes]
+    parts = [f"{part_name(n)}: {verdict(other)}." for n, other in enumerate(reconstruction.others, 2)]
+    return "\n".join(
+        [f"{verdict(reconstruction)}.", *notes, *parts, f"Result in {output}; open {output / 'report.html'}"]
+    )
+
+
+def median_reprojection_error(reconstruction: Reconstruction) -> float:
+    """Median over all observations, pixels; NaN where there is none."""
+    errors = reconstruction.observation_error
+    errors = errors[np.isfinite(errors)]
+    return float(np.median(errors)) if len(errors) else float("nan")
+
+
+def focal_range(reconstruction: Reconstruction) -> tuple[float, float] | None:
+    """Shortest and longest focal length of the frames, pixels; None where they share one."""
+    focals = [frame.camera.mean_focal_length() for frame in reconstruction.frames if frame.camera is not None]
+    return (min(focals), max(focals)) if focals else None
+
+
+def pooled_observability(reconstruction: Reconstruction) -> dict[str, float] | None:
+    """Medians over the registered cameras, and the largest pixel slide; None where nothing is known."""
+    cameras = [asdict(f.observability) for f in reconstruction.frames if f.observability is not None]
+    if not cameras:
+        return None
+    columns = {name: np.array([camera[name] for camera in cameras]) for name in cameras[0]}
+    known = {name: values[np.isfinite(values)] for name, values in columns.items()}  # a camera may see no point
+    pooled = {name: float(np.median(values)) if len(values) else math.nan for name, values in known.items()}
+    return {**pooled, "largest_pixel_slide": max(known["pixel_slide"], default=math.nan)}
+
+
+def with_total(seconds: Mapping[str, float]) -> dict[str, float]:
+    """The stages, and their sum where no total has been measured."""
+    return {**seconds, "total": seconds.get("total", sum(seconds.values()))}
+
+
+def _frame_json(frame: FrameResult) -> dict[str, Any]:
+    prior = frame.prior
+    return {
+        "index": frame.index,
+        "name": frame.name,
+        "timestamp": frame.timestamp,
+        "status": frame.status,
+        "message": frame.message,
+        "registered": frame.registered,
+        "keyframe": frame.keyframe,
+        "observations": frame.observations,
+        "inliers": frame.inliers,
+        "reprojection_error": frame.reprojection_error,
+        "prior": prior
+        and {
+            "scale": prior.scale,
+            "scale_std": prior.scale_std,
+            "shift": prior.shift,
+            "shift_std": prior.shift_std,
+            "sigma": prior.sigma,
+        },
+        "observability": frame.observability and asdict(frame.observability),
+        "focal_length": frame.camera and frame.camera.mean_focal_length(),
+        "focal_std": frame.focal_std,
+    }

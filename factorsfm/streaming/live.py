@@ -1,0 +1,81 @@
+"""A source followed live: its frames are decoded beside the tracking, and every frame gives an update."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from factorsfm.camera.files import open_camera
+from factorsfm.frames.frame import Frame
+from factorsfm.frames.live_sources import RawFormat, Source, open_source
+from factorsfm.priors.depth import DepthKind, DepthPrior, open_depth
+from factorsfm.priors.masks import MaskPrior, open_masks
+from factorsfm.result.reconstruction import Reconstruction
+from factorsfm.streaming.frame_update import FrameUpdate
+from factorsfm.streaming.stream import Stream
+from factorsfm.support.context import Closing
+from factorsfm.support.options import Options
+
+
+class Live(Closing, Iterator[FrameUpdate]):
+    """Updates of a source's frames; `finish` gives the reconstruction. Made by `track`.
+
+    Attributes:
+        source: says how it ended. stream: gives the trajectory as it is known now.
+    """
+
+    def __init__(self, source: Source, stream: Stream) -> None:
+        self.source = source
+        self.stream = stream
+
+    def __next__(self) -> FrameUpdate:
+        return self.stream.push(next(self.source))
+
+    def finish(self, progress: Callable[[str, int, int | None], None] | None = None) -> Reconstruction:
+        """Stop reading, and polish over the frames that came; errors as in `Stream.finish`."""
+        self.source.close()
+        return self.stream.finish(progress)
+
+    def close(self) -> None:
+        """Stop reading, and give up what is not finished."""
+        self.source.close()
+        self.stream.close()
+
+
+def track(
+    source: str | Path | int | BinaryIO | Iterable[NDArray[np.uint8] | Frame],
+    *,
+    camera: str | Path | pycolmap.Camera | None = None,
+    depth: str | Path | DepthPrior | None = "tcmonodepth",
+    depth_kind: DepthKind | str | None = None,
+    masks: str | Path | MaskPrior | None = None,
+    preset: str = "default",
+    frames: slice | None = None,
+    raw: RawFormat | None = None,
+    watch: bool = False,
+    drop: bool | None = None,
+) -> Live:
+    """Follow a source: a pose for every frame as it arrives.
+
+    Args:
+        source, frames, raw, watch, drop: see `open_source`.
+        camera, depth, depth_kind, masks, preset: see `reconstruct`.
+
+    Example:
+        >>> with factorsfm.track("shot.mp4") as live:  # doctest: +SKIP
+        ...     for update in live:
+        ...         print(update.index, update.status, update.cam_from_world)
+        ...     reconstruction = live.finish()
+
+    Raises:
+        InputError: the source, the camera or a prior cannot be used.
+    """
+    options = Options.preset_named(preset)
+    prior = open_depth(depth, depth_kind) if options.uses_depth else None
+    stream = Stream(open_camera(camera), depth=prior, masks=open_masks(masks), options=options)
+    return Live(open_source(source, frames=frames, raw=raw, watch=watch, drop=drop), stream)

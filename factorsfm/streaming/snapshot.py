@@ -1,0 +1,133 @@
+"""A running stream as one file: plain values and arrays, written whole or not at all, and read without running code."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import tempfile
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorsfm.mapping.map_update import MapUpdate
+from factorsfm.mapping.mapped_images import MappedImage
+from factorsfm.priors.image_depth import ImageDepth
+from factorsfm.streaming.relocalization import View
+from factorsfm.support.errors import InputError
+from factorsfm.support.status import FrameStatus
+from factorsfm.tracks.image_tracks import ImageTracks
+
+_MAGIC = b"factorsfm-1\n"
+_CHECKSUM_BYTES = 32
+_DTYPES = {"bool", "uint8", "int32", "int64", "uint64", "float32", "float64"}
+_TYPES: dict[str, Any] = {t.__name__: t for t in (FrameStatus, ImageDepth, ImageTracks, MappedImage, MapUpdate, View)}
+
+
+def write_snapshot(path: Path, state: Mapping[str, Any]) -> None:
+    """Write a state: nested dicts, lists, tuples, numbers, strings, arrays, and the estimator's own records.
+
+    Raises:
+        InputError: the file cannot be written; an older one at its place is untouched.
+    """
+    chunks: list[bytes] = []
+    header = json.dumps(_packed(state, chunks)).encode()
+    body = b"".join([_MAGIC, len(header).to_bytes(8, "little"), header, *chunks])
+    temporary = None
+    try:
+        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
+            temporary = Path(file.name)
+            file.write(body)
+            file.write(hashlib.sha256(body).digest())
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError as error:
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)
+        raise InputError(f"snapshot {path} cannot be written: {error.strerror}") from error
+
+
+def read_snapshot(path: Path) -> dict[str, Any]:
+    """The state that `write_snapshot` wrote.
+
+    Raises:
+        InputError: the file cannot be read, is no snapshot, is torn, or holds anything but a state.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"snapshot {path} cannot be read: {error.strerror}") from error
+    if not data.startswith(_MAGIC):
+        raise InputError(f"{path} is not a snapshot of this version")
+    body, checksum = data[:-_CHECKSUM_BYTES], data[-_CHECKSUM_BYTES:]
+    if hashlib.sha256(body).digest() != checksum:
+        raise InputError(f"snapshot {path} is torn: its checksum is wrong")
+    begin = len(_MAGIC) + 8
+    end = begin + int.from_bytes(body[len(_MAGIC) : begin], "little")
+    try:
+        state = _Reader(body[end:]).value(json.loads(body[begin:end]))
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
+        raise InputError(f"snapshot {path} does not hold the state of a stream: {error!r}") from error
+    if not isinstance(state, dict):
+        raise InputError(f"snapshot {path} does not hold the state of a stream")
+    return state
+
+
+def _packed(value: Any, chunks: list[bytes]) -> Any:
+    """JSON, with the bytes of arrays in `chunks`."""
+    if isinstance(value, Enum):
+        return {"type": type(value).__name__, "value": value.value}
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, np.ndarray):
+        chunks.append(np.ascontiguousarray(value).tobytes())
+        return {"array": value.dtype.name, "shape": value.shape}
+    if isinstance(value, list | tuple):
+        return {type(value).__name__: [_packed(item, chunks) for item in value]}
+    if isinstance(value, Mapping):
+        return {"dict": [[_packed(k, chunks), _packed(v, chunks)] for k, v in value.items()]}
+    if is_dataclass(value) and type(value).__name__ in _TYPES:
+        record = {f.name: _packed(getattr(value, f.name), chunks) for f in fields(value)}
+        return {"type": type(value).__name__, "fields": record}
+    raise TypeError(f"a {type(value).__name__} cannot be part of a snapshot")
+
+
+class _Reader:
+    """Takes the arrays from the bytes in the order in which they were written."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+        self._position = 0
+
+    def value(self, packed: Any) -> Any:
+        if not isinstance(packed, dict):
+            return packed
+        if "array" in packed:
+            return self._array(packed["array"], packed["shape"])
+        if "list" in packed:
+            return [self.value(item) for item in packed["list"]]
+        if "tuple" in packed:
+            return tuple(self.value(item) for item in packed["tuple"])
+        if "dict" in packed:
+            return {self.value(key): self.value(item) for key, item in packed["dict"]}
+        if "fields" in packed:
+            return _TYPES[packed["type"]](**{name: self.value(item) for name, item in packed["fields"].items()})
+        return _TYPES[packed["type"]](packed["value"])
+
+    def _array(self, dtype: str, shape: list[int]) -> NDArray[Any]:
+        if dtype not in _DTYPES:
+            raise ValueError(f"arrays of {dtype} are not expected")
+        if any(length < 0 for length in shape):
+            raise ValueError(f"an array of shape {shape}")
+        size = math.prod(shape) * np.dtype(dtype).itemsize
+        begin, self._position = self._position, self._position + size
+        return np.frombuffer(self._data[begin : self._position], dtype).reshape(shape).copy()

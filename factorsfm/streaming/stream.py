@@ -1,0 +1,425 @@
+"""Frames in, poses out: the tracker, the priors and the mapper joined; `finish` polishes over all frames."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import astuple, dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from factorsfm.camera.files import camera_from_json, camera_to_json, check_camera
+from factorsfm.camera.guess import first_focal_std, guess_camera
+from factorsfm.camera.projection import lens_shape, normalized_from_pixels, with_focal
+from factorsfm.control.known import Control, LocatedControl, locate
+from factorsfm.frames.frame import Frame, as_frame
+from factorsfm.frames.texture import BLANK_TEXTURE
+from factorsfm.graph.process import GraphProcess
+from factorsfm.lens.rolling_shutter import Recording
+from factorsfm.mapping.mapped_images import MappedImage
+from factorsfm.mapping.mapper import Mapper
+from factorsfm.polish.polish import polish
+from factorsfm.priors.depth import DepthKind, DepthPrior
+from factorsfm.priors.image_depth import ImageDepth
+from factorsfm.priors.masks import MaskPrior
+from factorsfm.priors.read_priors import read_depth, read_mask
+from factorsfm.report.thumbnails import Thumbnails
+from factorsfm.result.assembly import assemble
+from factorsfm.result.reconstruction import FrameResult, Reconstruction
+from factorsfm.streaming.frame_update import FrameUpdate, KeyframePrior
+from factorsfm.streaming.snapshot import read_snapshot, write_snapshot
+from factorsfm.streaming.view_finder import ViewFinder
+from factorsfm.support.context import Closing
+from factorsfm.support.errors import InputError, ModelError, ReconstructionError
+from factorsfm.support.options import Options
+from factorsfm.support.status import FrameStatus
+from factorsfm.support.threads import OneThreadEach
+from factorsfm.tracks.colors import TrackColors
+from factorsfm.tracks.flow import FlowTracker
+from factorsfm.tracks.image_tracks import ImageTracks
+
+logger = logging.getLogger(__name__)
+
+_STATE = ("_size", "_lens_given", "_pixels", "_without_depth")
+_LEAST_SIDE = 32  # pixels: room for the patches of the tracker
+
+
+@dataclass(frozen=True, slots=True)
+class SeenFrame:
+    """What is kept of a frame: never its pixels."""
+
+    index: int
+    name: str
+    timestamp: float | None
+    texture: float
+
+
+class Stream(Closing):
+    """Incremental reconstruction of one shot.
+
+    Args:
+        camera: the lens; None takes EXIF of the first frame's file or guesses a field of view, and refines it in
+            `finish`.
+        depth: prior, or None.
+        masks: what to ignore, or None.
+        options: see `Options`; None is the default preset.
+        control: what is known beforehand of poses and points; it takes part in `finish`. Not part of snapshots.
+
+    Example:
+        >>> stream = factorsfm.Stream(camera, depth=factorsfm.DepthModel("model.onnx"))  # doctest: +SKIP
+        >>> for frame in factorsfm.read_frames("shot.mp4"):  # doctest: +SKIP
+        ...     update = stream.push(frame)
+        >>> reconstruction = stream.finish()  # doctest: +SKIP
+    """
+
+    def __init__(
+        self,
+        camera: pycolmap.Camera | None = None,
+        *,
+        depth: DepthPrior | None = None,
+        masks: MaskPrior | None = None,
+        options: Options | None = None,
+        control: Control | None = None,
+    ) -> None:
+        self.camera = camera
+        self._lens_given = camera is not None
+        self.control = control
+        self.options = options or Options()
+        self.seconds: dict[str, float] = defaultdict(float)
+        self.frames: list[SeenFrame] = []
+        self._depth = depth if self.options.uses_depth else None
+        self._masks = masks
+        self._tracker = FlowTracker(self.options.tracker)
+        self._finder = ViewFinder(self._tracker)
+        self._thumbnails = Thumbnails()
+        self._threads: OneThreadEach | None = None
+        self._graph = GraphProcess()  # it starts while the source opens
+        self._mapper: Mapper | None = None
+        self._size = (0, 0)
+        self._colors = TrackColors()
+        self._pixels: list[NDArray[np.float64]] = []
+        self._without_depth: dict[int, str] = {}  # why the prior failed, by the frame's index
+
+    def push(self, frame: Frame | NDArray[np.uint8]) -> FrameUpdate:
+        """Take the next frame.
+
+        Args:
+            frame: a `Frame`, or an image (h, w, 3) BGR or (h, w) grey.
+
+        Raises:
+            InputError: it is no image, its size differs from that of the frames before or contradicts the camera, or
+                a prior fails on it (the depth prior: before there is a map, later the frame goes without); the stream
+                can go on with another frame.
+        """
+        frame = as_frame(frame, len(self.frames))
+        mapper = self._mapper or self._open(frame)
+        focal_changed = self._follow_focal(mapper)
+        if frame.image.shape[1::-1] != self._size:
+            raise InputError(
+                f"frame {frame.index} is {frame.image.shape[1]}x{frame.image.shape[0]}, "
+                f"expected {self._size[0]}x{self._size[1]} as the frames before"
+            )
+        with self._timed("masks"):
+            mask = read_mask(self._masks, frame)
+        with self._timed("tracking"):
+            grey = np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY), np.uint8)
+            tracked = self._tracker.track(grey, mask, self._finder.expected(mapper, self.camera))
+        self._colors.remember(frame.image, tracked.ids, tracked.xy)
+        with self._timed("mapping"):
+            mapper.advance()
+        focal_changed |= self._follow_focal(mapper)
+        xy = normalized_from_pixels(self.camera, tracked.xy)
+        usable = np.isfinite(xy).all(axis=1)  # a distortion model may have no inverse in the corners
+        usable &= tracked.texture >= BLANK_TEXTURE  # what is tracked in a blank image is its noise
+        pixels = tracked.xy[usable]
+        tracks = ImageTracks(len(self.frames), tracked.ids[usable], xy[usable])
+        with self._timed("mapping"):
+            image = mapper.add(tracks, lambda: self._read_depth(frame, pixels))
+        focal_changed |= self._follow_focal(mapper)
+        self.frames.append(SeenFrame(frame.index, frame.name, frame.timestamp, tracked.texture))
+        self._pixels.append(pixels)
+        self._thumbnails.add(frame.image)
+        if len(mapper.burn_ins):
+            self._tracker.avoid(mapper.burn_ins)
+            self._forget(mapper, mapper.burn_ins)
+        with self._timed("relocalization"):
+            self._pixels[-1] = self._finder.keep_in_sight(mapper, image, grey, self._pixels[-1], self.camera)
+        if image.status is not FrameStatus.WAITING:  # it may still take part in the start
+            _mark_blank(image, tracked.texture)
+        return self._frame_update(frame, image, focal_changed)
+
+    def trajectory(self) -> list[pycolmap.Rigid3d | None]:
+        """`cam_from_world` of every frame so far as the graph knows it now, None where a frame is not registered.
+
+        The map takes over what the graph is working on, and the frames between keyframes are registered on it again.
+        """
+        if self._mapper is None:
+            return []
+        self._mapper.refresh()
+        return [_pose(image) for image in self._mapper.images]
+
+    @property
+    def points(self) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+        """(n, 3) points of the map as it is now, and (n, 3) their colours, RGB."""
+        if self._mapper is None:
+            return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+        ids, points = self._mapper.points.all()
+        return points, self._colors.table[ids]
+
+    @property
+    def tracks(self) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """(n, 2) tracked points of the newest frame (pixels), and (n,) whether the map holds them."""
+        if self._mapper is None or not self._pixels:
+            return np.zeros((0, 2)), np.zeros(0, bool)
+        return self._pixels[-1], self._mapper.points.contains(self._mapper.images[-1].tracks.ids)
+
+    def save(self, path: str | Path) -> None:
+        """Write everything that is known so far as one file, whole or not at all; the stream can go on.
+
+        Raises:
+            InputError: the file cannot be written.
+        """
+        write_snapshot(
+            Path(path),
+            {
+                **{name: getattr(self, name) for name in _STATE},
+                "camera": camera_to_json(self.camera) if self.camera is not None else None,
+                "focal_told": self.camera is not None and self.camera.has_prior_focal_length,
+                "options": self.options.to_dict(),
+                "seconds": dict(self.seconds),
+                "frames": [astuple(frame) for frame in self.frames],
+                "tracker": self._tracker.state(),
+                "colors": self._colors.table,
+                "views": self._finder.relocalizer.views,
+                "thumbnails": self._thumbnails.state(),
+                "next_view": self._finder.relocalizer.next_view,
+                "mapper": self._mapper.state() if self._mapper is not None else None,
+            },
+        )
+
+    @classmethod
+    def load(cls, path: str | Path, *, depth: DepthPrior | None = None, masks: MaskPrior | None = None) -> Stream:
+        """Go on where a stream was saved; the next frame to push is number `len(stream.frames)`.
+
+        Args:
+            path: of the snapshot; depth, masks: the priors that the stream had.
+
+        Raises:
+            InputError: the file cannot be read, is torn, or is no snapshot.
+        """
+        state = read_snapshot(Path(path))
+        try:
+            stream = cls(depth=depth, masks=masks, options=Options.from_dict(state["options"]))
+            stream._restore(state)
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise InputError(f"snapshot {path} does not hold the state of a stream: {error!r}") from error
+        return stream
+
+    def _restore(self, state: dict[str, Any]) -> None:
+        for name in _STATE:
+            setattr(self, name, state[name])
+        if state["camera"] is not None:
+            self.camera = camera_from_json(state["camera"])
+            self.camera.has_prior_focal_length = state["focal_told"]
+        self.seconds.update(state["seconds"])
+        self.frames = [SeenFrame(*frame) for frame in state["frames"]]
+        self._tracker.restore(state["tracker"])
+        self._finder = ViewFinder(self._tracker, state["views"], state["next_view"])
+        self._colors = TrackColors(state["colors"])
+        self._thumbnails.restore(state["thumbnails"])
+        if state["mapper"] is not None:
+            self._mapper = self._new_mapper()
+            self._mapper.restore(state["mapper"])
+
+    def finish(self, progress: Callable[[str, int, int | None], None] | None = None) -> Reconstruction:
+        """Polish over all frames and tracks.
+
+        Raises:
+            InputError: the control names a frame that is not there.
+            ReconstructionError: no frame could be registered, or too few points remain.
+        """
+        mapper = self._mapper
+        if mapper is None or len(self.frames) < 2:
+            raise self._failure(f"frames in the shot: {len(self.frames)}, at least 2 needed")
+        with self:
+            try:
+                return self._polished(mapper, progress)
+            except ReconstructionError as error:
+                raise error if error.frames else self._failure(str(error)) from error
+
+    def _polished(self, mapper: Mapper, progress: Callable[[str, int, int | None], None] | None) -> Reconstruction:
+        with self._timed("mapping"):
+            mapper.finish()
+        self._follow_focal(mapper)
+        control = self._located_control()
+        for image, seen in zip(mapper.images, self.frames, strict=True):
+            _mark_blank(image, seen.texture)
+        registered = sum(image.registered for image in mapper.images)
+        if registered < 2:
+            worst = next((i for i in mapper.images if not i.registered), mapper.images[0])
+            raise self._failure(
+                f"{registered} of {len(mapper.images)} frames registered, at least 2 needed; "
+                f"frame {self.frames[worst.tracks.position].index}: {worst.message}"
+            )
+        with self._timed("polish"):
+            result = polish(
+                mapper.images,
+                mapper.points.all(),
+                np.array([mapper.focal]),
+                self.options,
+                lambda stage: progress(stage, 0, None) if progress else None,
+                lens_shape(self.camera) if self.options.estimates_lens else None,
+                control=control,
+                first_focal=(np.array([mapper.first_focal]), first_focal_std(self.camera, given=self._lens_given)),
+                recording=self._recording(),
+            )
+        reconstruction = assemble(
+            result,
+            mapper.images,
+            self.frames,
+            self._pixels,
+            self._colors.table,
+            self.camera,
+            lens_given=self._lens_given,
+            prior_given=self._depth is not None,
+            metric=self._depth is not None and self._depth.kind is DepthKind.METRIC,
+            seconds=dict(self.seconds),
+            options=self.options.to_dict(),
+        )
+        if self._without_depth:
+            count, first = len(self._without_depth), next(iter(self._without_depth.values()))
+            reconstruction.notes.append(f"Frames that went without depth because the prior failed: {count}; {first}.")
+        if mapper.without_prior:
+            reconstruction.notes.append(f"The map went on without the depth prior: {mapper.without_prior}.")
+        self._thumbnails.attach(reconstruction.frames)
+        return reconstruction
+
+    def _recording(self) -> Recording | None:
+        """What a rolling shutter is looked for in."""
+        shutter = self.options.shutter
+        if shutter == "global" or (shutter == "auto" and self.control is not None):
+            return None
+        return Recording(*self._size, np.array([frame.index for frame in self.frames]))
+
+    def _located_control(self) -> LocatedControl | None:
+        if self.control is None:
+            return None
+        return locate(self.control, self.frames, lambda position, xy: normalized_from_pixels(self.camera, xy))
+
+    def close(self) -> None:
+        """Give up without a result; `finish` closes, too."""
+        self._graph.close()
+        if self._threads is not None:
+            self._threads.close()
+
+    def _forget(self, mapper: Mapper, ids: NDArray[np.int64]) -> None:
+        """Tracks are left out of the images before the newest, which the graph may be working on."""
+        for k, image in enumerate(mapper.images[:-1]):
+            keep = ~np.isin(image.tracks.ids, ids)
+            if not keep.all():
+                image.tracks, self._pixels[k] = image.tracks.of(keep), self._pixels[k][keep]
+
+    def _open(self, frame: Frame) -> Mapper:
+        """Everything that waits for the size of the first frame."""
+        height, width = frame.image.shape[:2]
+        if min(height, width) < _LEAST_SIDE:
+            raise InputError(f"the images have {width}x{height} pixels; at least {_LEAST_SIDE} on each side are needed")
+        if self.camera is None:
+            self.camera = guess_camera(width, height, frame.path)
+            self.options = self.options.for_unknown_lens()
+        check_camera(self.camera, width, height)
+        if self.options.estimates_lens:
+            lens_shape(self.camera)  # refuses what cannot be estimated
+        self._size = (width, height)
+        self._mapper = self._new_mapper()
+        return self._mapper
+
+    def _follow_focal(self, mapper: Mapper) -> bool:
+        """Take over the focal length with which the mapper normalises; whether it is another one."""
+        assert self.camera is not None
+        if math.isclose(mapper.focal, self.camera.mean_focal_length(), rel_tol=1e-12):
+            return False
+        self.camera = with_focal(self.camera, mapper.focal)
+        return True
+
+    def _new_mapper(self) -> Mapper:
+        assert self.camera is not None
+        self._threads = OneThreadEach()
+        focal = 0.5 * (self.camera.focal_length_x + self.camera.focal_length_y)
+        return Mapper(self._graph, focal, self._size[0], self.options, has_prior=self._depth is not None)
+
+    def _frame_update(self, frame: Frame, image: MappedImage, focal_changed: bool) -> FrameUpdate:
+        mapper = self._mapper
+        assert mapper is not None
+        prior = None
+        guided = [k for k in mapper.keyframes if mapper.images[k].affine and mapper.images[k].tracks.depth]
+        if guided and not mapper.without_prior:
+            keyframe = mapper.images[guided[-1]]
+            assert keyframe.affine is not None
+            assert keyframe.tracks.depth is not None
+            unit = keyframe.tracks.depth.unit
+            prior = KeyframePrior(self.frames[guided[-1]].index, keyframe.affine[0] * unit, keyframe.affine[1] * unit)
+        return FrameUpdate(
+            frame.index, image.status, image.message, _pose(image), image.keyframe, len(image.tracks.ids),
+            image.inliers, mapper.new_points, mapper.parallax, image.covariance, prior, frame.dropped,
+            focal_length=mapper.focal, focal_changed=focal_changed,
+            starts_anew=mapper.starts_anew, note=mapper.note,
+        )  # fmt: skip
+
+    def _failure(self, message: str) -> ReconstructionError:
+        images = self._mapper.images if self._mapper is not None else []
+        frames = [
+            FrameResult(
+                frame.index, frame.name, frame.timestamp, image.status, image.message, _pose(image),
+                image.keyframe, len(image.tracks.ids), image.inliers,
+            )
+            for frame, image in zip(self.frames, images, strict=True)
+        ]  # fmt: skip
+        self._thumbnails.attach(frames)
+        return ReconstructionError(message, frames)
+
+    def _read_depth(self, frame: Frame, xy: NDArray[np.float64]) -> ImageDepth | None:
+        """The prior at keypoints; once there is a map, a frame on which it fails goes without."""
+        assert self._depth is not None
+        assert self._mapper is not None
+        if frame.index in self._without_depth:
+            return None
+        with self._timed("depth"):
+            try:
+                return read_depth(self._depth, frame, xy)
+            except ModelError as error:
+                if not self._mapper.started:
+                    raise
+                logger.warning("%s; the frame goes without", error)
+                self._without_depth[frame.index] = str(error)
+                return None
+
+    @contextmanager
+    def _timed(self, stage: str) -> Iterator[None]:
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[stage] += time.perf_counter() - start
+
+
+def _mark_blank(image: MappedImage, texture: float) -> None:
+    """Where an image without texture is not registered, that is the reason to give."""
+    if texture < BLANK_TEXTURE and not image.registered:
+        image.status = FrameStatus.BLANK
+        image.message = f"contrast {texture:.2f} of {BLANK_TEXTURE:.2f} needed grey levels"
+
+
+def _pose(image: MappedImage) -> pycolmap.Rigid3d | None:
+    if image.rotation is None:
+        return None
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(image.rotation), image.translation)

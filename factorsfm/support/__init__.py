@@ -1,0 +1,1 @@
+"""What every room may use: errors, options, statuses, threads, rotations and similarities. Imports no other room."""

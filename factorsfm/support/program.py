@@ -1,0 +1,15 @@
+"""The name and the version of this program."""
+
+from __future__ import annotations
+
+from importlib.metadata import PackageNotFoundError, version
+
+PROGRAM = "factorsfm"
+
+
+def program_version() -> str:
+    """Version of the installed package; "unknown" in a checkout that is not installed."""
+    try:
+        return version(PROGRAM)
+    except PackageNotFoundError:
+        return "unknown"

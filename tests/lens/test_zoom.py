@@ -1,0 +1,115 @@
+"""A zoom: followed in every frame, told from motion, and not found where there is none."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from factorsfm import Options, Stream
+from factorsfm.lens.lens import through
+from factorsfm.polish.polish import polish
+from factorsfm.report.result_folder import write_folder
+from factorsfm.result.reading import read_result
+from factorsfm.result.summary import focal_range, summary
+from factorsfm.support.options import FOCAL_STD
+from factorsfm.support.status import ShotKind
+from factorsfm.synthetic import render_shot, simulate_prior
+from tests.estimation_problems import angles_between, make_problem, mapped_images
+from tests.rendered import Maps, errors_of, with_fewer_tracks
+
+FRAMES = 16
+
+
+def profile(zoom, frames=FRAMES):
+    time = np.linspace(0, 1, frames)
+    return zoom ** (time**2 * (3 - 2 * time))
+
+
+def polished(motion, zoom, *, parallax, guess=1.15, max_frames=400, noise_px=0.05):
+    """The polish of a shot that zooms, from tracks normalised by one wrong focal length and a map without zoom."""
+    problem = make_problem(motion, frames=FRAMES, points=200, parallax=parallax, noise_px=noise_px)
+    o = problem.observations
+    start = through(problem.truth, guess * np.exp(problem.truth.log_focal))
+    factor = profile(zoom) / guess
+    seen = replace(problem, observations=replace(o, xy=o.xy * factor[o.frame, None]))
+    options = replace(Options.preset_named("geometry"), lens="zoom")
+    options = replace(options, polish=replace(options.polish, max_frames=max_frames))
+    points = np.arange(len(start.bearing)), start.points
+    result = polish(mapped_images(seen, start), points, guess * np.exp(problem.truth.log_focal), options)
+    return problem, result
+
+
+@pytest.mark.parametrize(("motion", "parallax"), [("arc", 0.3), ("rotation", 0.0)])
+@pytest.mark.parametrize("zoom", [1.4, 0.8])
+def test_a_zoom_is_followed_in_every_frame(motion, parallax, zoom):
+    problem, result = polished(motion, zoom, parallax=parallax)
+    error = np.log(result.state.focal / (problem.focal * profile(zoom)))
+    assert result.lens.determined
+    assert 1e-7 < np.abs(error).max() < 0.02
+    assert (result.lens.focal_std < FOCAL_STD).all()
+    assert angles_between(result.state.rotation, problem.truth.rotation).max() < 2e-3
+    assert result.motion.kind is (ShotKind.ROTATION if motion == "rotation" else ShotKind.GENERAL)
+
+
+def test_the_course_of_a_zoom_is_known_where_the_focal_length_is_not():
+    _, result = polished("static", 1.4, parallax=0.0)
+    assert not result.lens.determined
+    course = result.state.focal / result.state.focal[0]
+    np.testing.assert_allclose(course, profile(1.4), rtol=2e-3)
+    assert 1e-6 < result.lens.zoom_std < 1e-3
+    assert result.motion.kind is ShotKind.STATIC
+
+
+def test_no_zoom_is_found_where_there_is_none():
+    problem, result = polished("arc", 1.0, parallax=0.3)
+    assert len(result.state.log_focal) == 1
+    assert result.lens.determined
+    assert 1e-6 < result.lens.zoom_std < 0.01
+    assert result.state.focal[0] == pytest.approx(problem.focal, rel=0.02)
+
+
+def test_frames_between_the_solved_ones_have_the_focal_length_between():
+    problem, result = polished("rotation", 1.4, parallax=0.0, max_frames=8)
+    assert result.frames == list(range(FRAMES))
+    np.testing.assert_allclose(result.state.focal, problem.focal * profile(1.4), rtol=0.01)
+    assert np.median(result.errors) < 1.0
+
+
+@pytest.fixture(scope="module")
+def shot():
+    return render_shot("handheld", 24, 320, 180, parallax=0.06, zoom=1.4)
+
+
+@pytest.fixture(scope="module")
+def reconstruction(shot):
+    options = replace(with_fewer_tracks(Options(), 400), lens="zoom")
+    stream = Stream(depth=Maps(simulate_prior(shot)), options=options)
+    for image in shot.images:
+        stream.push(image)
+    return stream.finish()
+
+
+def test_a_rendered_zoom_is_followed(shot, reconstruction):
+    assert len(reconstruction.registered) == 24
+    focals = np.array([reconstruction.camera_of(frame).mean_focal_length() for frame in reconstruction.frames])
+    course = focals / focals[0]
+    assert 1e-6 < np.abs(course / shot.zoom - 1).max() < 0.02
+    if reconstruction.lens.determined:
+        assert np.abs(focals / (shot.camera.focal_length_x * shot.zoom) - 1).max() < 0.02
+    assert reconstruction.lens.zoom_std < 0.005
+    assert focal_range(reconstruction) == pytest.approx((focals.min(), focals.max()))
+    assert any("changes from" in note for note in reconstruction.notes)
+    assert 0 < errors_of(reconstruction, shot).r_rpe.max() < 1.0
+
+
+def test_a_zoom_survives_its_files(reconstruction, tmp_path):
+    write_folder(reconstruction, tmp_path / "result")
+    back = read_result(tmp_path / "result")
+    for before, after in zip(reconstruction.frames, back.frames, strict=True):
+        np.testing.assert_array_equal(after.camera.params, before.camera.params)
+        assert after.focal_std == before.focal_std
+    np.testing.assert_allclose(back.camera.params, reconstruction.camera.params)
+    np.testing.assert_allclose(
+        np.median(back.observation_error), np.median(reconstruction.observation_error), rtol=0.05
+    )
+    assert summary(back)["focal_range"] == pytest.approx(summary(reconstruction)["focal_range"])

@@ -1,0 +1,82 @@
+"""Images that the map loses, on synthetic tracks whose cameras are known."""
+
+import numpy as np
+import pytest
+
+from factorsfm.graph.process import GraphProcess
+from factorsfm.mapping.mapped_images import MappedImage
+from factorsfm.mapping.mapper import Mapper
+from factorsfm.support.options import Options
+from factorsfm.support.status import FrameStatus
+from factorsfm.tracks.image_tracks import ImageTracks
+from tests.estimation_problems import angles_between, make_problem
+
+
+def lost_at_both_ends(problem, known, life):
+    """A mapper that holds some images and the tracks of their first, each track seen for so many images."""
+    mapper = Mapper(GraphProcess(), problem.focal, 640, Options.preset_named("geometry"), has_prior=False)
+    born = np.arange(len(problem.points)) % (problem.frames + life) - life + 1
+    for k in range(problem.frames):
+        ids, xy = problem.of_frame(k)
+        alive = (born[ids] <= k) & (k < born[ids] + life)
+        tracks = ImageTracks(k, ids[alive], xy[alive])
+        image = MappedImage(tracks, FrameStatus.LOST, "0 of 15 needed tracks have a point in the map")
+        if k in known:
+            image.status = FrameStatus.REGISTERED
+            image.rotation, image.translation = problem.truth.rotation[k], problem.truth.translation[k]
+            image.inliers, image.threshold, image.keyframe = len(tracks.ids), 3.0, True
+            mapper.keyframes.append(k)
+        mapper.images.append(image)
+    ids = mapper.images[known[0]].tracks.ids
+    mapper.points.set(ids, problem.points[ids])
+    mapper.started = True
+    return mapper
+
+
+@pytest.mark.parametrize("noise_px", [0.0, 0.1])
+def test_images_before_and_after_the_map_are_taken_up_at_the_end(noise_px):
+    problem = make_problem("truck", frames=30, points=200, parallax=0.3, noise_px=noise_px)
+    mapper = lost_at_both_ends(problem, range(10, 20), life=9)
+    mapper.finish()
+    assert all(image.registered for image in mapper.images)
+    rotation = np.array([image.rotation for image in mapper.images])
+    center = np.array([-image.rotation.T @ image.translation for image in mapper.images])
+    true_center = -np.einsum("kji,kj->ki", problem.truth.rotation, problem.truth.translation)
+    limit = 1e-6 if noise_px == 0.0 else 0.02
+    error = np.linalg.norm(center - true_center, axis=1)
+    np.testing.assert_array_equal(error[10:20], 0.0)
+    assert error.max() < limit * np.linalg.norm(true_center[-1] - true_center[0])
+    assert angles_between(rotation, problem.truth.rotation).max() < limit
+
+
+def test_images_that_share_no_track_with_the_map_stay_lost_and_say_why():
+    problem = make_problem("truck", frames=12, points=200, parallax=0.3)
+    mapper = lost_at_both_ends(problem, range(6), life=12)
+    for image in mapper.images[9:]:
+        image.tracks = ImageTracks(image.tracks.position, image.tracks.ids + 1000, image.tracks.xy)
+        image.message = "something else"
+    mapper.finish()
+    assert [image.registered for image in mapper.images] == 9 * [True] + 3 * [False]
+    assert {(image.status, image.message) for image in mapper.images[9:]} == {(FrameStatus.LOST, "something else")}
+
+
+def test_a_lost_image_is_registered_on_tracks_that_no_keyframe_saw():
+    problem = make_problem("truck", frames=12, points=200, parallax=0.3)
+    mapper = lost_at_both_ends(problem, range(10), life=9)
+    mapper.images, newest = mapper.images[:10], mapper.images[10]
+    image = mapper.add(newest.tracks, lambda: None)
+    mapper.close()
+    assert image.status is FrameStatus.REGISTERED
+    np.testing.assert_allclose(image.translation, problem.truth.translation[10], atol=1e-6)
+
+
+def test_rotations_stay_rotations_however_long_the_shot():
+    problem = make_problem("truck", frames=160, points=300, parallax=0.9)
+    mapper = Mapper(GraphProcess(), problem.focal, 640, Options.preset_named("geometry"), has_prior=False)
+    for k in range(problem.frames):
+        mapper.add(ImageTracks(k, *problem.of_frame(k)), lambda: None)
+    mapper.close()
+    assert len(mapper.keyframes) > 20
+    rotation = np.array([image.rotation for image in mapper.images])
+    product = rotation @ rotation.transpose(0, 2, 1)
+    np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), product.shape), atol=1e-12)
