@@ -29,10 +29,11 @@ from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.noise import coordinate_sigma
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.state import State
-from factorsfm.camera.projection import normalized_from_pixels, pixels_from_normalized, with_focal, with_lens
+from factorsfm.camera.projection import normalized_from_pixels, pixels_from_normalized, with_focal
 from factorsfm.evaluation.metrics import auc, relative_pose_errors
 from factorsfm.evaluation.readers import read_shot
 from factorsfm.evaluation.truth import Shot
+from factorsfm.lens.camera_model import with_distortion
 from factorsfm.lens.lens import Lens, renormalized
 from factorsfm.support.options import PolishOptions
 
@@ -95,7 +96,7 @@ def true_lens(shot: Shot, k1: float, k2: float) -> pycolmap.Camera:
     rim = [np.stack([along, np.full(65, end)], 1) for end in (0.0, 1.0)]
     edge = np.concatenate([*rim, *(side[:, ::-1] for side in rim)]) * last
     while True:
-        lens = with_lens(shot.camera, focal, np.array([k1, k2, 0.0, 0.0]))
+        lens = with_distortion(shot.camera, focal, np.array([k1, k2, 0.0, 0.0]))
         seen = pixels_from_normalized(shot.camera, normalized_from_pixels(lens, edge))
         if (np.abs(seen - 0.5 * last) <= 0.5 * last + 0.01).all():
             return lens

@@ -1,4 +1,4 @@
-"""Camera files: JSON with the names and conventions of OpenCV or COLMAP."""
+"""Camera files: JSON with the names of OpenCV or COLMAP."""
 
 from __future__ import annotations
 
@@ -15,19 +15,20 @@ from numpy.typing import NDArray
 from factorsfm.camera.projection import PIXEL_CENTER
 from factorsfm.support.errors import InputError
 
-# Focal length over the longer side: beyond, a unit has been mistaken. A lens of 2,000 mm on Super 35 film has 80.
+# Smallest and largest focal length over the longer image side; one outside has the wrong unit, such as millimetres.
+# A 2,000 mm lens on Super 35 film has a ratio of 80.
 _FOCAL_RATIOS = (0.05, 200.0)
 
 
 def read_camera(path: str | Path) -> pycolmap.Camera:
     """Read a camera from a JSON file.
 
-    The file holds ``width, height, fx, fy, cx, cy`` in pixels with centres at integers (a PINHOLE camera), or
-    ``width, height`` and ``model, params`` with the names and the order of COLMAP, principal point also with
-    centres at integers. Further keys are ignored.
+    The file holds ``width, height, fx, fy, cx, cy`` in pixels (a PINHOLE camera), or ``width, height`` and
+    ``model, params`` with the names and the order of COLMAP. Pixel centres are at integers in both forms. Further keys
+    are ignored.
 
     Raises:
-        InputError: not readable, not JSON, a key missing, or a value that is no camera's.
+        InputError: the file cannot be read or is not JSON, a key is missing, or a value is out of range.
     """
     path = Path(path)
     try:
@@ -45,7 +46,7 @@ def read_camera(path: str | Path) -> pycolmap.Camera:
 
 
 def open_camera(camera: str | Path | pycolmap.Camera | None) -> pycolmap.Camera | None:
-    """The camera that a user means: itself, or that of a camera file.
+    """The camera given as a `pycolmap.Camera`, or as the path of a camera file; None stays None.
 
     Raises:
         InputError: it is neither, or as in `read_camera`.
@@ -58,7 +59,7 @@ def open_camera(camera: str | Path | pycolmap.Camera | None) -> pycolmap.Camera 
 
 
 def camera_to_json(camera: pycolmap.Camera) -> dict[str, Any]:
-    """The content of a camera file, as `read_camera` reads it."""
+    """The content of a camera file that `read_camera` reads."""
     return {
         "width": camera.width,
         "height": camera.height,
@@ -72,7 +73,7 @@ def camera_to_json(camera: pycolmap.Camera) -> dict[str, Any]:
 
 
 def check_camera(camera: pycolmap.Camera, width: int, height: int) -> None:
-    """Insist that the camera belongs to images of this size.
+    """Check that the camera has the size of the images, in pixels.
 
     Raises:
         InputError: it has another size.
@@ -84,7 +85,11 @@ def check_camera(camera: pycolmap.Camera, width: int, height: int) -> None:
 
 
 def camera_from_json(content: Mapping[str, Any]) -> pycolmap.Camera:
-    """A camera from the content of a camera file; errors as in `read_camera`."""
+    """The camera from the content of a camera file.
+
+    Raises:
+        InputError: a key is missing, or a value is out of range.
+    """
     width, height = (_size(content, key) for key in ("width", "height"))
     if ("model" in content) != ("params" in content):
         raise InputError('"model" and "params" go together; one of them is missing')

@@ -1,4 +1,4 @@
-"""The first guess of an unknown lens: EXIF data, or the usual field of view."""
+"""The first guess of an unknown lens: the focal length from EXIF data, or a usual field of view."""
 
 from __future__ import annotations
 
@@ -8,32 +8,34 @@ from pathlib import Path
 
 import pycolmap
 
-from factorsfm.support.options import GUESSED_FOCAL_STD, TOLD_FOCAL_STD
+from factorsfm.support.options import GIVEN_FOCAL_STD, GUESSED_FOCAL_STD
 
 logger = logging.getLogger(__name__)
 
-# Between a 27 mm lens on Super 35 film and a 39 mm lens on full frame: the middle of the usual film
-# lenses (18 to 50 mm on Super 35, 69 to 28 degrees), so that the guess is wrong by a factor of two at most.
-GUESSED_FIELD_OF_VIEW = math.radians(50)
+# That of a 27 mm lens on Super 35 film, or 39 mm on full frame. The usual film lenses (18 to 50 mm on Super 35) span 69
+# to 28 degrees, so that the guess is wrong by a factor of two at most.
+_FIELD_OF_VIEW_DEG = 50.0
+
+_EXIF_RATIOS = (0.2, 30.0)  # focal length over the longer image side; a value outside is an error in the file
 
 
 def guess_camera(width: int, height: int, image_path: Path | None = None) -> pycolmap.Camera:
-    """First guess of an unknown lens: SIMPLE_PINHOLE, principal point in the middle.
+    """First guess of an unknown lens: SIMPLE_PINHOLE, principal point in the middle of the image.
 
     Args:
-        width, height: size of the images in pixels.
-        image_path: an image whose EXIF data may tell the focal length (35 mm equivalent; or focal length with
-            the focal plane's resolution or with a sensor that COLMAP knows).
+        width, height: size of the images, pixels.
+        image_path: an image whose EXIF data may hold the focal length: as 35 mm equivalent, or with the resolution of
+            the focal plane, or with a camera whose sensor COLMAP knows.
 
     Returns:
-        A camera whose `has_prior_focal_length` says whether the focal length is from EXIF; otherwise the
-        longer side spans 50 degrees.
+        A camera whose `has_prior_focal_length` is True if the focal length is from EXIF data. Otherwise the longer side
+        spans 50 degrees.
     """
     longer = max(width, height)
     focal_length = _exif_focal_ratio(image_path) * longer if image_path is not None else 0.0
     known = focal_length > 0
     if not known:
-        focal_length = longer / 2 / math.tan(GUESSED_FIELD_OF_VIEW / 2)
+        focal_length = longer / 2 / math.tan(math.radians(_FIELD_OF_VIEW_DEG) / 2)
     return pycolmap.Camera(
         camera_id=1,
         model="SIMPLE_PINHOLE",
@@ -45,20 +47,24 @@ def guess_camera(width: int, height: int, image_path: Path | None = None) -> pyc
 
 
 def first_focal_std(camera: pycolmap.Camera, *, given: bool) -> float:
-    """How well a focal length is known before its images are seen, relative; `given`: by a camera file."""
-    return TOLD_FOCAL_STD if given or camera.has_prior_focal_length else GUESSED_FOCAL_STD
+    """Relative standard deviation of a focal length before any image is used.
+
+    Args:
+        given: whether the user gave the camera.
+    """
+    return GIVEN_FOCAL_STD if given or camera.has_prior_focal_length else GUESSED_FOCAL_STD
 
 
 def _exif_focal_ratio(image_path: Path) -> float:
-    """Focal length from EXIF over the longer side of the image, 0 if there is none to trust."""
+    """Focal length from EXIF data over the longer image side; 0 if there is none that can be trusted."""
     try:
         camera = pycolmap.infer_camera_from_image(image_path)
-    except ValueError:  # an unreadable image is reported by whoever reads the frames
+    except ValueError:  # whoever reads the frames reports an unreadable image
         return 0.0
     ratio = float(camera.mean_focal_length() / max(camera.width, camera.height))
     if not camera.has_prior_focal_length:
         return 0.0
-    if not 0.2 < ratio < 30:
-        logger.warning("ignoring the EXIF focal length of %s: %.3g times the image's size", image_path, ratio)
+    if not _EXIF_RATIOS[0] < ratio < _EXIF_RATIOS[1]:
+        logger.warning("ignoring the EXIF focal length of %s: it is %.3g times the longer side", image_path, ratio)
         return 0.0
     return ratio

@@ -15,12 +15,13 @@ import pycolmap
 from numpy.typing import NDArray
 
 from factorsfm.camera.guess import first_focal_std, guess_camera
-from factorsfm.camera.projection import PIXEL_CENTER, lens_shape, normalized_from_pixels, with_focal, with_lens
+from factorsfm.camera.projection import PIXEL_CENTER, normalized_from_pixels, with_focal
 from factorsfm.control.known import Control, LocatedControl, locate
 from factorsfm.frames.frame import Frame, bgr_image
 from factorsfm.imagesets.cameras import describe_cameras, find_cameras
 from factorsfm.imagesets.mapper import SetMapper, map_parts
 from factorsfm.imagesets.photo_folder import Photo, PhotoFolder
+from factorsfm.lens.camera_model import distortion_of, with_distortion
 from factorsfm.lens.lens import LensEstimate
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.polish.polish import polish
@@ -257,7 +258,7 @@ class ImageSet:
                     np.array([part.focal]),
                     options,
                     lambda stage: progress(stage, 0, None),
-                    lens_shape(camera) if options.estimates_lens else None,
+                    distortion_of(camera) if options.estimates_lens else None,
                     control=control and _scaled(control, camera.mean_focal_length() / part.focal),
                     first_focal=(np.array([part.first_focal]), first_focal_std(camera, given=self._lens_given)),
                 )
@@ -317,7 +318,7 @@ class ImageSet:
         lenses = []
         for k, camera in enumerate(self._cameras):
             focal = ratio * camera.mean_focal_length()
-            own = with_focal(camera, focal) if shape is None else with_lens(camera, focal, shape)
+            own = with_focal(camera, focal) if shape is None else with_distortion(camera, focal, shape)
             lenses.append(_resized(result.camera, (camera.width, camera.height)) if k == 0 else own)
         shared = Counter(p.camera for p, f in zip(self.photos, result.frames, strict=True) if f.registered)
         most = shared.most_common(1)[0][0]

@@ -17,7 +17,7 @@ from factorsfm.lens.certainty import lens_deviations
 from factorsfm.lens.lens import READOUT_SIGMA, Lens, LensEstimate, renormalized, shape_sigmas, through
 from factorsfm.lens.search import search_lens
 from factorsfm.motion.shot_kind import LEAST_GAIN, classify_motion, translation_gain
-from factorsfm.support.options import FOCAL_STD, TOLD_FOCAL_STD, Options, PolishOptions
+from factorsfm.support.options import FOCAL_STD, GIVEN_FOCAL_STD, Options, PolishOptions
 from factorsfm.support.status import ShotKind
 
 Array = NDArray[np.float64]
@@ -121,7 +121,7 @@ def estimate_lens(
     known, rough, final = best.known and bool(sound), False, lens
     if not known:
         # In a long valley a standard deviation says little.
-        counts = sound and float(best.std[:groups].max()) < TOLD_FOCAL_STD
+        counts = sound and float(best.std[:groups].max()) < GIVEN_FOCAL_STD
         focal, rough = _kept_focal(lens.focal, focal_std, first_focal or (guess.focal, 0.0), counts=counts)
         final = Lens(focal, lens.shape if rough else guess.shape)
     state, observations, before = adjustment.state, adjustment.observations, guess

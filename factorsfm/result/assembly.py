@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from factorsfm.adjustment.observations import DISTORTION
 from factorsfm.adjustment.state import State
-from factorsfm.camera.projection import with_focal, with_lens
+from factorsfm.camera.projection import with_focal
+from factorsfm.lens.camera_model import with_distortion
 from factorsfm.lens.lens import LensEstimate
 from factorsfm.lens.rolling_shutter import Shutter
 from factorsfm.mapping.mapped_images import MappedImage
@@ -79,7 +80,7 @@ def assemble(
     lens = polished.lens
     if lens is not None:
         focal = float(np.median(state.focal))
-        camera = with_lens(camera, focal, lens.lens.shape) if lens.lens.bends else with_focal(camera, focal)
+        camera = with_distortion(camera, focal, lens.lens.shape) if lens.lens.bends else with_focal(camera, focal)
     kept, row_of = _usable_points(polished)
     observations = polished.observations
     keep = row_of[observations.point] >= 0

@@ -19,11 +19,12 @@ from numpy.typing import NDArray
 
 from factorsfm.camera.files import camera_from_json, camera_to_json, check_camera
 from factorsfm.camera.guess import first_focal_std, guess_camera
-from factorsfm.camera.projection import lens_shape, normalized_from_pixels, with_focal
+from factorsfm.camera.projection import normalized_from_pixels, with_focal
 from factorsfm.control.known import Control, LocatedControl, locate
 from factorsfm.frames.frame import Frame, as_frame
 from factorsfm.frames.texture import BLANK_TEXTURE
 from factorsfm.graph.process import GraphProcess
+from factorsfm.lens.camera_model import distortion_of
 from factorsfm.lens.rolling_shutter import Recording
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.mapping.mapper import Mapper
@@ -277,7 +278,7 @@ class Stream(Closing):
                 np.array([mapper.focal]),
                 self.options,
                 lambda stage: progress(stage, 0, None) if progress else None,
-                lens_shape(self.camera) if self.options.estimates_lens else None,
+                distortion_of(self.camera) if self.options.estimates_lens else None,
                 control=control,
                 first_focal=(np.array([mapper.first_focal]), first_focal_std(self.camera, given=self._lens_given)),
                 recording=self._recording(),
@@ -338,7 +339,7 @@ class Stream(Closing):
             self.options = self.options.for_unknown_lens()
         check_camera(self.camera, width, height)
         if self.options.estimates_lens:
-            lens_shape(self.camera)  # refuses what cannot be estimated
+            distortion_of(self.camera)  # refuses what cannot be estimated
         self._size = (width, height)
         self._mapper = self._new_mapper()
         return self._mapper

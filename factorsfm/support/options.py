@@ -10,7 +10,7 @@ from factorsfm.support.errors import InputError
 
 FOCAL_STD = 0.016  # relative standard deviation up to which a focal length counts as determined
 GUESSED_FOCAL_STD = 0.3  # of a focal length that nothing tells: fields of view of 30 to 75 degrees
-TOLD_FOCAL_STD = 0.05  # of one from EXIF data or a camera file that is to be refined
+GIVEN_FOCAL_STD = 0.05  # of one from EXIF data or a camera file that is to be refined
 
 LensFreedom = Literal["auto", "fixed", "focal", "radial", "distortion", "all", "zoom"]
 ShutterUse = Literal["auto", "global", "rolling"]

@@ -23,7 +23,7 @@ from factorsfm.polish.camera_starts import _everywhere
 from factorsfm.polish.polish import polish
 from factorsfm.result.notes import lens_note
 from factorsfm.support.errors import InputError
-from factorsfm.support.options import FOCAL_STD, TOLD_FOCAL_STD, Options, PolishOptions
+from factorsfm.support.options import FOCAL_STD, GIVEN_FOCAL_STD, Options, PolishOptions
 from factorsfm.support.status import ShotKind
 from tests.estimation_problems import make_problem, mapped_images
 
@@ -254,7 +254,7 @@ def test_a_focal_length_that_is_not_determined_is_the_mean_of_guess_and_estimate
     alone = estimated(problem, guess=1.2, lens="focal", first_std=10.0).lens
     assert alone.rough
     assert not alone.determined
-    assert 0.02 < alone.focal_std < TOLD_FOCAL_STD
+    assert 0.02 < alone.focal_std < GIVEN_FOCAL_STD
     found = np.log(alone.lens.focal[0] / problem.focal)
     result = estimated(problem, guess=1.2, lens="focal", first_std=first_std)
     assert result.lens.rough == (alone.focal_std < first_std)
