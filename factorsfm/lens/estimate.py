@@ -17,7 +17,7 @@ from factorsfm.lens.certainty import lens_deviations
 from factorsfm.lens.lens import READOUT_SIGMA, Lens, LensEstimate, renormalized, shape_sigmas, through
 from factorsfm.lens.search import search_lens
 from factorsfm.motion.shot_kind import LEAST_GAIN, classify_motion, translation_gain
-from factorsfm.support.options import FOCAL_STD, GIVEN_FOCAL_STD, Options, PolishOptions
+from factorsfm.support.options import DETERMINED_FOCAL_STD, GIVEN_FOCAL_STD, Options, PolishOptions
 from factorsfm.support.status import ShotKind
 
 Array = NDArray[np.float64]
@@ -26,7 +26,7 @@ logger = logging.getLogger(__name__)
 
 _CLEARLY = 0.9  # of the cost without distortion, at which the shot asks for some
 _TOLERANCE = 1e-5  # the focal length lies along a flat valley
-_OPEN_FOCAL_STD = 0.02  # like `FOCAL_STD`, with what a distortion that is not believed leaves open
+_OPEN_FOCAL_STD = 0.02  # like `DETERMINED_FOCAL_STD`, with what a distortion that is not believed leaves open
 _HELD_STD = 1e-6  # relative, of a focal length that is known
 _LARGEST_RATIO = 4.0  # of the focal length to its guess
 _MISFIT = 1.5  # of the standard deviation above which a solution is doubted
@@ -104,7 +104,7 @@ def estimate_lens(
     start, observations = seen_through(first)
     straight, moves = _solved_as_it_moves(start, observations, o, adjustment.sigma, straight_sigmas, focal_prior)
     std, left_out, _ = lens_deviations(straight)
-    best = _Solution(straight, moves, std, left_out, _largest(std, left_out, groups) < FOCAL_STD)
+    best = _Solution(straight, moves, std, left_out, _largest(std, left_out, groups) < DETERMINED_FOCAL_STD)
     # Strong distortion moves the valley of the focal length: a start without any does not lead there.
     starts = [(*seen_through(bent), adjustment.sigma, True)] if bent is not None else []
     starts += [(straight.state, straight.observations, straight.sigma, moves)] if bends else []
@@ -156,8 +156,8 @@ def _judged_shape(straight: _Solution, free: tuple[BundleAdjustment, bool], gues
     )  # fmt: skip
     joint = _JOINT_DISPLACEMENT * width * float(np.median(guess.focal)) / max(displacement, 1e-9)
     believed = evidence > _LEAST_EVIDENCE * (1.0 + evidence * joint**2)  # both variances add up
-    if believed and std[:groups].max() < FOCAL_STD:
-        return _Solution(full, moves, std, left_out, _largest(std, left_out, groups) < FOCAL_STD)
+    if believed and std[:groups].max() < DETERMINED_FOCAL_STD:
+        return _Solution(full, moves, std, left_out, _largest(std, left_out, groups) < DETERMINED_FOCAL_STD)
     # A distortion that is not believed may be there all the same: second moment around what is kept.
     moved = np.append(full.state.log_focal - straight.adjustment.state.log_focal, np.full(LENS_SIZE, np.nan))
     std, left_out = (

@@ -1,1 +1,1 @@
-"""What every room may use: errors, options, statuses, threads, rotations and similarities. Imports no other room."""
+"""What every room may import: errors, options, statuses, threads, rotations, similarities. Imports no other room."""

@@ -1,4 +1,4 @@
-"""Every error that the library raises on purpose: one root, one subclass per reason."""
+"""The errors that the library raises: one root, one subclass per reason."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class ReconstructionError(FactorsfmError):
     """The input is fine but this shot cannot be reconstructed (command line: exit status 3).
 
     Attributes:
-        frames: what became of every frame, as far as it is known (`FrameResult`).
+        frames: a `FrameResult` for every frame whose fate is known.
     """
 
     def __init__(self, message: str, frames: Sequence[Any] = ()) -> None:

@@ -1,4 +1,4 @@
-"""Valid JSON of numpy values, paths and numbers that do not exist."""
+"""Valid JSON from numpy values, paths and non-finite numbers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 
 def json_text(value: Any, indent: int | None = 1) -> str:
-    """Valid JSON: NaN and infinity become null, numpy values and paths plain ones."""
+    """Valid JSON: NaN and infinity become null, numpy values become numbers and lists, everything else its string."""
     separators = (",", ":") if indent is None else None
     return json.dumps(_plain(value), indent=indent, separators=separators, allow_nan=False, ensure_ascii=False)
 

@@ -8,9 +8,10 @@ from typing import Any, Literal
 
 from factorsfm.support.errors import InputError
 
-FOCAL_STD = 0.016  # relative standard deviation up to which a focal length counts as determined
-GUESSED_FOCAL_STD = 0.3  # of a focal length that nothing tells: fields of view of 30 to 75 degrees
-GIVEN_FOCAL_STD = 0.05  # of one from EXIF data or a camera file that is to be refined
+# Relative standard deviations of a focal length.
+DETERMINED_FOCAL_STD = 0.016  # up to this, an estimate counts as determined
+GUESSED_FOCAL_STD = 0.3  # of the guess where nothing is known: fields of view of 30 to 75 degrees
+GIVEN_FOCAL_STD = 0.05  # of one from EXIF data, or from a camera file and refined
 
 LensFreedom = Literal["auto", "fixed", "focal", "radial", "distortion", "all", "zoom"]
 ShutterUse = Literal["auto", "global", "rolling"]
@@ -22,15 +23,15 @@ class TrackerOptions:
     """Tracking in video (`tracks.flow`).
 
     Attributes:
-        max_tracks: tracks alive at a time.
-        replenish_below: start new tracks when this share of `max_tracks` is free.
+        max_tracks: most tracks alive at a time.
+        replenish_below: share of `max_tracks` that must be free before new tracks start.
         window_px: side of the Lucas-Kanade window.
         levels: pyramid levels above the full image in the flow from frame to frame.
-        border_px: distance to the image border that tracks keep.
+        border_px: smallest distance of a track to the image border.
         flow_check_px: largest forward-backward error of the flow from frame to frame.
         realign_check_px: largest forward-backward error of the re-alignment with the birth patch.
         realign_reach_px: largest correction by the re-alignment.
-        corner_quality: weakest corner as a share of the strongest (Shi-Tomasi).
+        corner_quality: Shi-Tomasi score of the weakest corner, as a share of the strongest in the image.
     """
 
     max_tracks: int = 1000
@@ -46,26 +47,27 @@ class TrackerOptions:
 
 @dataclass(frozen=True, slots=True)
 class MapperOptions:
-    """The three steps of the paper and the incremental graph (`mapper`).
+    """The three steps of the paper and the incremental graph (`mapping`).
 
     Attributes:
-        initialization: "lifted" lifts the first image alone and registers the next frames on it; "pair" is the
-            paper's: the pair with most matches of valid depth, lift and PnP; "essential" uses no depth.
-        registration_depth, triangulation_depth: depth residual in these steps: none, the paper's in the depth
-            domain, or ours in the inverse-depth domain.
-        graph_depth: depth-consistency factors with free scale and shift in the incremental graph.
+        initialization: "lifted" lifts the tracks of the first image by its depth and registers the next frames on them;
+            "pair" is the paper's: it lifts one image of the pair with the most matches of valid depth and finds the
+            other by PnP; "essential" uses no depth.
+        registration_depth, triangulation_depth: depth residual in these steps: none, the paper's ("paper", of depth),
+            or that of inverse depth ("inverse").
+        graph_depth: whether the incremental graph has depth-consistency factors, with a scale and a shift per keyframe.
         depth_weight: the paper's lambda.
         min_tracks: fewest tracked points with which a frame is registered.
         min_inliers: fewest inliers of a registered frame.
-        inlier_px: largest reprojection error of an inlier at registration, widened where the map is still rough.
-        keyframe_flow: median flow since the last keyframe that makes a new one (share of the image width).
-        keyframe_interval: frames after which a keyframe is made at the latest.
-        landmarks: landmarks of the graph that a keyframe sees.
-        graph_iterations: steps of the graph at a keyframe.
-        graph_delay: frames after a keyframe at which the map takes over what the graph made of it, later where the map
-            has settled; until then the graph works beside the registration.
+        inlier_px: largest reprojection error of an inlier at registration; larger while the map is still inaccurate.
+        keyframe_flow: median flow since the last keyframe that makes the next one, as a share of the image width.
+        keyframe_interval: most frames between two keyframes.
+        landmarks: most landmarks that a keyframe observes in the graph.
+        graph_iterations: iterations of the graph at a keyframe.
+        graph_delay: frames between a keyframe and the one at which the map takes over its update; more once the map has
+            converged. Until then the graph works in parallel with the registration.
         pixel_sigma: standard deviation of a tracked point in the graph (pixels).
-        essential_angle_deg: median triangulation angle that a start without depth waits for.
+        essential_angle_deg: median triangulation angle that a start without depth needs.
     """
 
     initialization: Literal["lifted", "pair", "essential"] = "lifted"
@@ -87,21 +89,22 @@ class MapperOptions:
 
 @dataclass(frozen=True, slots=True)
 class PolishOptions:
-    """The batch polish (`refinement`).
+    """The batch polish (`polish`).
 
     Attributes:
-        depth: whether the prior takes part, with the weight that its own residuals justify.
-        iterations: at most, until the cameras have converged on the core tracks.
-        final_iterations: at most, over all tracks and the prior from there.
-        tolerance: relative decrease of the cost at which a stage ends.
+        depth: whether the depth prior takes part; its residuals determine its weight.
+        iterations: most iterations of the first stage, which solves for the cameras on the core tracks.
+        final_iterations: most iterations of the second stage, over all tracks and the prior.
+        tolerance: relative decrease of the cost below which a stage ends.
         kernel: scale of the Cauchy kernel in standard deviations.
-        min_track_length: frames in which a track must be seen.
-        point_sigma: weak prior of every inverse distance around its start, in units of the scene's median.
-        max_frames: frames that are variables; in a longer shot the others are registered on the polished points.
-        outlier_sigmas: tracks beyond this many robust standard deviations of all tracks are removed.
-        observation_sigmas: single observations with larger errors than this many standard deviations are removed
-            instead; None removes whole tracks only.
-        doubtful_px: standard deviation of the errors above which a solution is doubted and other starts are tried.
+        min_track_length: fewest frames that observe a track.
+        point_sigma: standard deviation of a weak prior on every inverse distance around its start, in units of the
+            scene's median.
+        max_frames: most frames that are variables; the others of a longer shot are registered on the polished points.
+        outlier_sigmas: a track whose error exceeds this many robust standard deviations of all tracks is removed.
+        observation_sigmas: single observations whose error exceeds this many standard deviations are removed instead;
+            None removes whole tracks only.
+        doubtful_px: standard deviation of the reprojection errors above which other starts are tried.
     """
 
     depth: bool = True
@@ -122,15 +125,15 @@ class Options:
     """Everything that can be set.
 
     Attributes:
-        preset: name from which the options were made.
-        lens: what the polish estimates where the shot determines it: nothing, the focal length, also the radial
-            distortion, or also the principal point; "radial" is the distortion alone; "zoom" is "distortion" with a
-            focal length for every frame, where the shot shows that it changes; "auto" is "fixed" for a given camera and
-            "distortion" for none, "all" in an image set with much parallax.
-        shutter: what the polish of a video does with a rolling shutter that the shot shows. "auto": lens and points are
-            free of it, and poses are those with which a camera without one would show them most nearly as the recorded
-            images do; with control it is not looked for, since known poses mostly stem from what knows none. "rolling":
-            poses are those of the moment at which the middle of the image is read. "global": it is not looked for.
+        preset: name of the preset from which the options were made.
+        lens: what the polish estimates, as far as the shot determines it. "fixed": nothing; "focal": the focal length;
+            "radial": the radial distortion; "distortion": both; "all": also the principal point; "zoom": "distortion"
+            with a focal length for every frame, if the shot shows that it changes; "auto": "fixed" if a camera is
+            given, otherwise "distortion", or "all" in an image set with much parallax.
+        shutter: what the polish of a video does about a rolling shutter. "auto" estimates the readout and removes its
+            effect from lens and points; the poses are those of a global shutter that reproduce the recorded images
+            best. With control, "auto" assumes a global shutter, because known poses usually do. "rolling" gives the
+            poses at the time when the middle of the image is read. "global" assumes a global shutter.
     """
 
     preset: str = "default"
@@ -152,7 +155,7 @@ class Options:
         return PRESETS[name]
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data, as written beside every result."""
+        """Plain data, as `summary.json` holds it."""
         return asdict(self)
 
     @classmethod
@@ -170,16 +173,16 @@ class Options:
 
     @property
     def estimates_lens(self) -> bool:
-        """Whether anything of the lens is an unknown of the polish."""
+        """Whether the polish estimates any part of the lens."""
         return self.lens not in ("auto", "fixed")
 
     @property
     def refine_focal_length(self) -> bool:
-        """Whether the focal length is unknown, in the map as in the polish."""
+        """Whether the mapper and the polish estimate the focal length."""
         return self.estimates_lens and self.lens != "radial"
 
     def for_unknown_lens(self) -> Options:
-        """What "auto" means without a camera."""
+        """The options for a shot without a camera: "auto" becomes "distortion"."""
         return replace(self, lens="distortion") if self.lens == "auto" else self
 
     @property

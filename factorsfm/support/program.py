@@ -8,7 +8,7 @@ PROGRAM = "factorsfm"
 
 
 def program_version() -> str:
-    """Version of the installed package; "unknown" in a checkout that is not installed."""
+    """Version of the installed package, or "unknown" where it is not installed."""
     try:
         return version(PROGRAM)
     except PackageNotFoundError:

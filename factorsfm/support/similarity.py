@@ -1,4 +1,4 @@
-"""Similarity alignment of an estimated trajectory to the truth, over the registered frames."""
+"""Similarity transforms, and the alignment of an estimated trajectory to the true one."""
 
 from __future__ import annotations
 
@@ -10,14 +10,12 @@ import pycolmap
 from numpy.typing import NDArray
 
 from factorsfm.support.errors import InputError
-from factorsfm.support.rotations import nearest_rotation
+from factorsfm.support.rotations import cross_matrices, nearest_rotation
 
 Array = NDArray[np.float64]
 
-# Second over first singular value of the centres below which they count as a line, and extent over the
-# largest coordinate below which they count as one point.
-_LINE = 1e-4
-_POINT = 1e-9
+_COLLINEAR = 1e-4  # second over first singular value of the centres, below which they lie on a line
+_COINCIDENT = 1e-9  # extent over the largest coordinate, below which the centres are one point
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,26 +33,26 @@ class Similarity:
     translation: Array
 
     def points(self, points: Array) -> Array:
-        """Points (n, 3) of the estimate in the frame of the truth."""
+        """Points (n, 3) of the estimate in the world of the truth."""
         return self.scale * points @ self.rotation.T + self.translation
 
     def rotations(self, world_from_cam: Array) -> Array:
-        """Orientations (n, 3, 3) of the estimate in the frame of the truth."""
+        """Rotations world_from_cam (n, 3, 3) of the estimate in the world of the truth."""
         return self.rotation @ world_from_cam
 
 
 def registered_frames(centers: Array) -> NDArray[np.bool_]:
-    """(n,) true where the centre (n, 3) is known: unregistered frames are NaN."""
+    """(n,) whether each camera centre (n, 3) is known; those of unregistered frames are NaN."""
     return np.asarray(np.isfinite(centers).all(axis=-1))
 
 
 def check_trajectories(
     rotations: Array, centers: Array, true_rotations: Array, true_centers: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """The four arrays as float64, after a check of their shapes.
+    """The four arrays as float64; a frame whose rotation or centre is not finite becomes NaN in both.
 
     Raises:
-        InputError: shapes other than (n, 3, 3) and (n, 3) with one n, or truth that is not finite.
+        InputError: shapes other than (n, 3, 3) and (n, 3) with the same n, or truth that is not finite.
     """
     arrays = [np.asarray(a, np.float64) for a in (rotations, centers, true_rotations, true_centers)]
     n = len(arrays[3])
@@ -94,19 +92,19 @@ def align(
     true_centers: Array,
     scale: float | None = None,
 ) -> Similarity:
-    """The similarity that takes estimated camera centres to the true ones with the least squared error.
+    """The similarity that maps estimated camera centres to the true ones with the least squared error.
 
-    Only the centres count (Umeyama's closed form), except where they leave the rotation open: on a line
-    the camera orientations decide the turn about that line, in a single point they decide all of it.
-    Where the estimate or the truth does not move, the centres say nothing about the scale: it is 1.
+    It comes from the centres alone (Umeyama 1991), except where they do not determine the rotation. If the centres lie
+    on a line, the camera rotations determine the angle about it; if they coincide, the camera rotations determine the
+    whole rotation. Where the estimate or the truth does not move, the scale is 1.
 
     Args:
         rotations, true_rotations: (n, 3, 3) world_from_cam; unregistered frames NaN.
         centers, true_centers: (n, 3); unregistered frames NaN.
-        scale: fixes the scale (a metric reconstruction, or one scaled by known depths); None estimates it.
+        scale: held at this value (a metric reconstruction, or one scaled by known depths); None estimates it.
 
     Raises:
-        InputError: no frame is registered, or the arrays do not fit together.
+        InputError: no frame is registered, or the shapes do not agree.
     """
     rotations, centers, true_rotations, true_centers = check_trajectories(
         rotations, centers, true_rotations, true_centers
@@ -117,36 +115,35 @@ def align(
     source, target = centers[use], true_centers[use]
     source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
     x, y = source - source_mean, target - target_mean
-    # turns[i] would make the orientation of camera i exact.
-    turns = true_rotations[use] @ rotations[use].transpose(0, 2, 1)
+    # Each camera's own rotation from the world of the estimate to that of the truth, summed.
+    true_from_estimate = (true_rotations[use] @ rotations[use].transpose(0, 2, 1)).sum(axis=0)
 
     rank = min(_rank(x, source), _rank(y, target))
     if rank == 0:
-        rotation, fitted = nearest_rotation(turns.sum(axis=0)), 1.0
+        rotation, fitted = nearest_rotation(true_from_estimate), 1.0
     else:
         u, d, vt = np.linalg.svd(y.T @ x)
         signs = np.array([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)])
         rotation, fitted = (u * signs) @ vt, float(d @ signs / np.sum(x**2))
         if rank == 1:
-            rotation = _turn_about(u[:, 0], rotation, turns.sum(axis=0)) @ rotation
+            rotation = _rotation_about(u[:, 0], rotation, true_from_estimate) @ rotation
     scale = fitted if scale is None else scale
     return Similarity(scale, rotation, target_mean - scale * rotation @ source_mean)
 
 
 def _rank(centered: Array, centers: Array) -> int:
-    """0: the centres coincide, 1: they lie on a line, 2: they fix a rotation."""
+    """0: the centres coincide, 1: they lie on a line, 2: they determine a rotation."""
     extent = np.linalg.svd(centered, compute_uv=False)
-    if extent[0] <= _POINT * max(float(np.abs(centers).max()), np.finfo(np.float64).tiny):
+    if extent[0] <= _COINCIDENT * max(float(np.abs(centers).max()), np.finfo(np.float64).tiny):
         return 0
-    return 1 if len(extent) < 2 or extent[1] <= _LINE * extent[0] else 2
+    return 1 if len(extent) < 2 or extent[1] <= _COLLINEAR * extent[0] else 2
 
 
-def _turn_about(axis: Array, rotation: Array, turns: Array) -> Array:
-    """The turn about the unit axis after which `rotation` is nearest to the summed turns (chordal)."""
-    x, y, z = axis
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    gain = rotation @ turns.T
+def _rotation_about(axis: Array, rotation: Array, wanted: Array) -> Array:
+    """The rotation about a unit axis after which `rotation` has the least chordal distance to a sum of rotations."""
+    cross = cross_matrices(axis[None])[0]
+    gain = rotation @ wanted.T
     along = axis @ gain @ axis
     angle = np.arctan2(np.trace(cross @ gain), np.trace(gain) - along)
-    turn: Array = np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
-    return turn
+    about: Array = np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
+    return about

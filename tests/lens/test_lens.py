@@ -23,7 +23,7 @@ from factorsfm.polish.camera_starts import _everywhere
 from factorsfm.polish.polish import polish
 from factorsfm.result.notes import lens_note
 from factorsfm.support.errors import InputError
-from factorsfm.support.options import FOCAL_STD, GIVEN_FOCAL_STD, Options, PolishOptions
+from factorsfm.support.options import DETERMINED_FOCAL_STD, GIVEN_FOCAL_STD, Options, PolishOptions
 from factorsfm.support.status import ShotKind
 from tests.estimation_problems import make_problem, mapped_images
 
@@ -140,7 +140,7 @@ def test_the_focal_length_is_found_from_a_wrong_guess(guess):
     error = result.lens.lens.focal[0] / problem.focal - 1
     assert result.lens.determined
     assert 1e-7 < abs(error) < 0.03
-    assert 1e-5 < result.lens.focal_std < FOCAL_STD
+    assert 1e-5 < result.lens.focal_std < DETERMINED_FOCAL_STD
     assert not result.lens.lens.shape.any()
 
 
@@ -245,7 +245,7 @@ def test_tiny_motion_or_none_but_along_the_view_axis_keeps_the_guess(motion, par
     assert not result.lens.determined
     assert not result.lens.rough
     assert np.exp(result.state.log_focal) == pytest.approx(1.2 * problem.focal)
-    assert result.lens.focal_std > FOCAL_STD
+    assert result.lens.focal_std > DETERMINED_FOCAL_STD
 
 
 @pytest.mark.parametrize("first_std", [0.02, 0.06, 0.3])

@@ -11,7 +11,7 @@ from factorsfm.polish.polish import polish
 from factorsfm.report.result_folder import write_folder
 from factorsfm.result.reading import read_result
 from factorsfm.result.summary import focal_range, summary
-from factorsfm.support.options import FOCAL_STD
+from factorsfm.support.options import DETERMINED_FOCAL_STD
 from factorsfm.support.status import ShotKind
 from factorsfm.synthetic import render_shot, simulate_prior
 from tests.estimation_problems import angles_between, make_problem, mapped_images
@@ -46,7 +46,7 @@ def test_a_zoom_is_followed_in_every_frame(motion, parallax, zoom):
     error = np.log(result.state.focal / (problem.focal * profile(zoom)))
     assert result.lens.determined
     assert 1e-7 < np.abs(error).max() < 0.02
-    assert (result.lens.focal_std < FOCAL_STD).all()
+    assert (result.lens.focal_std < DETERMINED_FOCAL_STD).all()
     assert angles_between(result.state.rotation, problem.truth.rotation).max() < 2e-3
     assert result.motion.kind is (ShotKind.ROTATION if motion == "rotation" else ShotKind.GENERAL)
 
