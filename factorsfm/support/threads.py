@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import os
 import threading
+from typing import ClassVar
+from weakref import WeakSet
 
 import cv2
 from threadpoolctl import threadpool_limits
@@ -23,31 +25,30 @@ def available_cores() -> list[int]:
 
 
 class OneThreadEach(Closing):
-    """Holds BLAS and OpenCV to one thread until it is closed; the last one to close gives back what was before."""
+    """Holds BLAS and OpenCV to one thread until it is closed; the last one to close gives back what was before.
+
+    One that is forgotten unclosed does not count any more, but gives nothing back: the next one that closes does. A
+    finaliser would have to take the lock, which the garbage collector may find taken by the thread that it interrupts.
+    """
 
     _lock = threading.Lock()
-    _holders = 0
-    _blas: threadpool_limits
-    _opencv = 0
+    _open: ClassVar[WeakSet[OneThreadEach]] = WeakSet()
+    _before: tuple[threadpool_limits, int] | None = None  # the threads of BLAS and of OpenCV; None while nobody holds
 
     def __init__(self) -> None:
-        self._open = True
         cls = OneThreadEach
         with cls._lock:
-            if cls._holders == 0:
-                cls._blas, cls._opencv = threadpool_limits(1, "blas"), cv2.getNumThreads()
+            cls._open.add(self)
+            if cls._before is None:
+                cls._before = threadpool_limits(1, "blas"), cv2.getNumThreads()
                 cv2.setNumThreads(1)
-            cls._holders += 1
 
     def close(self) -> None:
         """Give the threads back, if nobody else holds them; more than one call is as good as one."""
         cls = OneThreadEach
         with cls._lock:
-            cls._holders -= self._open
-            if self._open and cls._holders == 0:
-                cls._blas.restore_original_limits()
-                cv2.setNumThreads(cls._opencv)
-            self._open = False
-
-    def __del__(self) -> None:
-        self.close()
+            cls._open.discard(self)
+            if cls._before is not None and not cls._open:
+                (blas, opencv), cls._before = cls._before, None
+                blas.restore_original_limits()
+                cv2.setNumThreads(opencv)
