@@ -14,6 +14,8 @@ import pickle
 import signal
 import subprocess
 import sys
+import threading
+import time
 import weakref
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -38,7 +40,10 @@ sys.modules["factorsfm"], sys.path = package, sys.argv[2:]
 from factorsfm.graph.server import serve
 serve()
 """
-_SECONDS_TO_END = 5.0
+_SECONDS_TO_END = 5.0  # for a process whose output has ended
+# For an answer. An update takes less than a second: a machine that swaps or has no core free may take a hundred times
+# as long, but whoever waits longer waits for a process that hangs.
+_SECONDS_TO_ANSWER = 60.0
 
 
 class GraphProcess(Closing):
@@ -47,9 +52,7 @@ class GraphProcess(Closing):
     def __init__(self) -> None:
         self._worker = ThreadPoolExecutor(1, "factorsfm-graph")
         self._anew = True
-        self._process = _take()
-        self._give_back = weakref.finalize(self, _keep, self._process)
-        self._give_back.atexit = False
+        self._process: _Process | None = _Process()
 
     def submit(self, work: Callable[[], Result]) -> Future[Result]:
         """Do some work in a thread beside everything else, after all that was submitted before; it may `ask`."""
@@ -64,9 +67,16 @@ class GraphProcess(Closing):
         Raises:
             GraphProcessKilledError: the process was killed meanwhile; the next update has another one, and an empty
                 graph.
+            FactorsfmError: the process ended by itself, which another one would do, too.
         """
         request, self._anew = Request(update, subject, self._anew), False
-        answer = self._process.ask(request)
+        process, self._process = self._process or _Process(), None
+        try:
+            answer = process.ask(request)
+        except BaseException:  # Ctrl-C, too: this answer must not be taken for that of the next request
+            process.close()
+            raise
+        self._process = process
         for name, level, message in answer.log:
             logging.getLogger(name).log(level, message)
         if isinstance(answer.outcome, Exception):
@@ -78,22 +88,20 @@ class GraphProcess(Closing):
         self._anew = True
 
     def close(self) -> None:
-        """Wait for an update that is being made; others are lost."""
+        """Wait for an update that is being made, and end the process; further updates are lost."""
         self._worker.shutdown(cancel_futures=True)
-        self._give_back()
+        if self._process is not None:
+            self._process.close()
 
 
 class GraphProcessKilledError(FactorsfmError):
-    """A process was killed, from outside or by a crash; another one has been started."""
+    """A process was killed: from outside, by a crash, or because it gave no answer or none that can be understood."""
 
 
 class _Process:
     """The other side; it ends with this one, however this one ends."""
 
     def __init__(self) -> None:
-        self._start()
-
-    def _start(self) -> None:
         package = Path(__file__).parents[1]
         path = [entry or os.getcwd() for entry in sys.path]
         command = [spawn.get_executable(), "-c", _MAIN, str(package), *path]
@@ -101,40 +109,50 @@ class _Process:
         self._popen = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, process_group=0)
         self._end = weakref.finalize(self, _end, self._popen)
 
-    @property
-    def lives(self) -> bool:
-        return self._popen.poll() is None
-
     def ask(self, request: Request) -> Answer:
-        """Send a request and wait for the answer.
+        """Send a request and wait for the answer; after an error there must be no other request.
 
         Raises:
-            GraphProcessKilledError: the process was killed meanwhile.
-            FactorsfmError: it failed, which is no accident that another one would be spared.
+            GraphProcessKilledError: the process was killed meanwhile, or did not answer as it should.
+            FactorsfmError: it ended by itself.
         """
         requests, answers = _pipes(self._popen)
         data = pickle.dumps(request, pickle.HIGHEST_PROTOCOL)
+        begin = time.monotonic()
+        limit = threading.Timer(_SECONDS_TO_ANSWER, self._popen.kill)
+        limit.start()
         try:
             requests.write(data)
             requests.flush()
-            answer: Answer = pickle.load(answers)
-        except (OSError, EOFError, pickle.UnpicklingError) as error:
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                self._popen.wait(_SECONDS_TO_END)
-            self._end()
-            code = self._popen.returncode
-            if code >= 0:
-                raise FactorsfmError(
-                    f"the process of the graph ended with status {code}, see standard error"
-                ) from error
-            self._start()
-            raise GraphProcessKilledError(
-                f"the process of the graph was killed by {signal.Signals(-code).name}"
-            ) from error
+            answer = pickle.load(answers)
+        except Exception as error:  # whatever a torn pickle may raise
+            if time.monotonic() - begin > _SECONDS_TO_ANSWER:
+                reason = f"killed because it gave no answer within {_SECONDS_TO_ANSWER:g} s"
+                raise GraphProcessKilledError(f"the process of the graph was {reason}") from error
+            raise self._failure(error) from error
+        finally:
+            limit.cancel()
+            limit.join()
+        if not isinstance(answer, Answer):
+            raise GraphProcessKilledError(_not_understood(f"it is of type {type(answer).__name__}"))
         return answer
+
+    def _failure(self, error: Exception) -> FactorsfmError:
+        """What has become of a process whose answer cannot be read."""
+        try:
+            code = self._popen.wait(_SECONDS_TO_END)
+        except subprocess.TimeoutExpired:
+            return GraphProcessKilledError(_not_understood(repr(error)))
+        if code < 0:
+            return GraphProcessKilledError(f"the process of the graph was killed by {signal.Signals(-code).name}")
+        return FactorsfmError(f"the process of the graph ended with status {code}, see standard error")
 
     def close(self) -> None:
         self._end()
+
+
+def _not_understood(reason: str) -> str:
+    return f"the process of the graph was killed because its answer cannot be understood: {reason}"
 
 
 def _pipes(popen: subprocess.Popen[bytes]) -> tuple[IO[bytes], IO[bytes]]:
@@ -146,32 +164,8 @@ def _pipes(popen: subprocess.Popen[bytes]) -> tuple[IO[bytes], IO[bytes]]:
 def _end(popen: subprocess.Popen[bytes]) -> None:
     """End a process, which has nothing to tidy up."""
     requests, answers = _pipes(popen)
+    popen.kill()
     with contextlib.suppress(BrokenPipeError):  # something was left to be written
         requests.close()
     answers.close()
-    popen.kill()
     popen.wait()
-
-
-# One process is kept for the next map: a start costs as much as the tracking of ten frames or more.
-_kept: list[_Process] = []
-
-
-def _take() -> _Process:
-    """A process that nobody else uses."""
-    while _kept:
-        if (process := _kept.pop()).lives:
-            return process
-        process.close()
-    return _Process()
-
-
-def _keep(process: _Process) -> None:
-    if _kept:
-        process.close()
-    else:
-        _kept.append(process)
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_kept.clear)  # two processes must not talk to the same one

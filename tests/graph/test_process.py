@@ -4,9 +4,11 @@ import logging
 import multiprocessing.spawn
 import os
 import pickle
+import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -16,7 +18,7 @@ import pytest
 
 from factorsfm.graph import process as graph_process
 from factorsfm.graph.keyframe_graph import FactorGraph
-from factorsfm.graph.process import GraphProcess
+from factorsfm.graph.process import GraphProcess, GraphProcessKilledError
 from factorsfm.mapping.graph_updates import submit_update
 from factorsfm.mapping.map_update import MapCopy, update_map
 from factorsfm.mapping.point_map import PointMap
@@ -24,6 +26,7 @@ from factorsfm.support.errors import FactorsfmError
 from factorsfm.support.options import MapperOptions
 from factorsfm.support.threads import OneThreadEach
 from tests.estimation_problems import image_depth, make_problem, mapped_images, perturbed
+from tests.graph import updates
 
 OPTIONS = MapperOptions(landmarks=200)
 ROOT = Path(__file__).parents[2]
@@ -64,7 +67,7 @@ def graph():
 
 
 def pid_of(graph):
-    return graph._process._popen.pid
+    return graph.ask(updates.pid, None)
 
 
 def assert_equal(a, b):
@@ -165,31 +168,21 @@ def test_another_map_begins_with_an_empty_graph(graph, shot):
 # --- the process ------------------------------------------------------------------------------------------------
 
 
-def test_a_process_serves_one_map_after_the_other(shot):
-    pids = []
-    for _ in range(2):
-        with GraphProcess() as graph:
-            assert_equal(submit_update(graph, shot.copy(3), None).result(), update_map(shot.copy(3), FactorGraph()))
-            pids.append(pid_of(graph))
-    assert pids[0] == pids[1]
-
-
-def test_two_maps_at_once_have_a_process_each(shot):
+def test_two_maps_at_once_have_a_process_each_and_leave_none(shot):
     with GraphProcess() as first, GraphProcess() as second:
-        updates = [submit_update(graph, shot.copy(4), None) for graph in (first, second)]
-        assert_equal(updates[0].result(), updates[1].result())
+        pending = [submit_update(graph, shot.copy(4), None) for graph in (first, second)]
+        assert_equal(pending[0].result(), pending[1].result())
         pids = [pid_of(first), pid_of(second)]
     assert len(set(pids)) == 2
-    assert sum(map(has_ended, pids)) == 1  # one is kept
+    assert all(map(has_ended, pids))
 
 
-def test_a_graph_that_is_forgotten_gives_its_process_back(shot):
+def test_a_graph_that_is_forgotten_ends_its_process(shot):
     graph = GraphProcess()
     submit_update(graph, shot.copy(2), None).result()
     pid = pid_of(graph)
     del graph
-    wait_until(lambda: graph_process._kept)
-    assert [process._popen.pid for process in graph_process._kept] == [pid]
+    wait_until(lambda: has_ended(pid))
 
 
 def test_killed_in_the_middle_of_an_update(graph, shot, caplog):
@@ -211,27 +204,58 @@ def test_killed_in_the_middle_of_an_update(graph, shot, caplog):
     assert pid_of(graph) != pid
 
 
-def test_killed_while_nobody_needs_it(shot):
-    with GraphProcess() as graph:
-        submit_update(graph, shot.copy(2), None).result()
-        process = graph._process
-    os.kill(process._popen.pid, signal.SIGKILL)
-    wait_until(lambda: not process.lives)  # all of its threads
-    with GraphProcess() as graph:
-        assert submit_update(graph, shot.copy(2), None).result().committed
+def test_killed_between_two_updates(graph, shot):
+    submit_update(graph, shot.copy(2), None).result()
+    pid = pid_of(graph)
+    os.kill(pid, signal.SIGKILL)
+    wait_until(lambda: has_ended(pid))  # all of its threads
+    assert not submit_update(graph, shot.copy(3), None).result().committed
+    assert submit_update(graph, shot.copy(3), None).result().committed
 
 
-def test_a_fork_of_the_parent_leaves_it_alone(shot):
-    with GraphProcess() as graph:
-        submit_update(graph, shot.copy(2), None).result()
-        pid = pid_of(graph)
+@pytest.mark.parametrize(
+    ("update", "reason"),
+    [
+        (updates.never, "killed because it gave no answer within 0.5 s"),
+        (updates.torn, "killed because its answer cannot be understood: ValueError("),
+        (updates.no_answer, "killed because its answer cannot be understood: it is of type str"),
+    ],
+    ids=["none", "torn", "another"],
+)
+def test_a_process_that_does_not_answer_as_it_should_is_not_used_again(graph, shot, monkeypatch, update, reason):
+    assert graph.ask(updates.echo, 1) == 1
+    pid = pid_of(graph)
+    monkeypatch.setattr(graph_process, "_SECONDS_TO_ANSWER", 0.5)
+    monkeypatch.setattr(graph_process, "_SECONDS_TO_END", 0.5)
+    with pytest.raises(GraphProcessKilledError, match=re.escape(f"the process of the graph was {reason}")):
+        graph.ask(update, None)
+    monkeypatch.undo()
+    assert has_ended(pid)
+    assert_equal(submit_update(graph, shot.copy(4), None).result(), update_map(shot.copy(4), FactorGraph()))
+    assert pid_of(graph) != pid
+
+
+def test_an_answer_that_nobody_waited_for_is_not_taken_for_the_next(graph):
+    assert graph.ask(updates.echo, 1) == 1
+    pid = pid_of(graph)
+    interrupt = threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT))
+    interrupt.start()
+    with pytest.raises(KeyboardInterrupt):
+        graph.ask(updates.slow_echo, 2)
+    assert graph.ask(updates.echo, 3) == 3
+    assert has_ended(pid)
+
+
+def test_a_fork_of_the_parent_leaves_it_alone(graph, shot):
+    submit_update(graph, shot.copy(2), None).result()
+    pid = pid_of(graph)
     fork = os.fork()
     if fork == 0:
-        os._exit(len(graph_process._kept))
+        graph.close()
+        os._exit(0)
     assert os.waitpid(fork, 0)[1] == 0
-    with GraphProcess() as graph:
-        assert pid_of(graph) == pid
-        assert submit_update(graph, shot.copy(2), None).result().committed
+    assert submit_update(graph, shot.copy(2), None).result().committed
+    assert pid_of(graph) == pid
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -252,8 +276,7 @@ def broken_interpreter(tmp_path):
     multiprocessing.set_executable(before)
 
 
-def test_an_interpreter_that_cannot_run_is_an_error(shot, monkeypatch, broken_interpreter):
-    monkeypatch.setattr(graph_process, "_kept", [])
+def test_an_interpreter_that_cannot_run_is_an_error(shot, broken_interpreter):
     with GraphProcess() as graph, pytest.raises(FactorsfmError, match="the process of the graph ended with status 3"):
         submit_update(graph, shot.copy(2), None).result()
 

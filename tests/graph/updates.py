@@ -1,0 +1,41 @@
+"""Updates that no map asks for, which the process of the graph imports by name."""
+
+import os
+import time
+from typing import Any
+
+from factorsfm.graph import server
+from factorsfm.graph.keyframe_graph import FactorGraph
+
+
+class Torn:
+    """What cannot be read where it arrives."""
+
+    def __reduce__(self) -> Any:
+        return int, ("torn",)
+
+
+def echo(subject: Any, graph: FactorGraph) -> Any:
+    return subject
+
+
+def pid(subject: Any, graph: FactorGraph) -> int:
+    return os.getpid()
+
+
+def slow_echo(subject: Any, graph: FactorGraph) -> Any:
+    time.sleep(1.0)
+    return subject
+
+
+def never(subject: Any, graph: FactorGraph) -> None:
+    time.sleep(1000.0)
+
+
+def torn(subject: Any, graph: FactorGraph) -> Torn:
+    return Torn()
+
+
+def no_answer(subject: Any, graph: FactorGraph) -> None:
+    """Instead of its answer the process sends a word."""
+    server.Answer = lambda outcome, log: "hello"
