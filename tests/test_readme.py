@@ -1,4 +1,4 @@
-"""Every example of the README runs, and what it says of commands, options, formats and statuses is so."""
+"""Every example of the README and of the pages in docs/ runs, and what they say of options, formats and files is so."""
 
 import hashlib
 import json
@@ -24,32 +24,68 @@ from factorsfm.synthetic import render_shot, write_shot
 from tests.priors.test_models import save_network
 
 ROOT = Path(__file__).resolve().parents[1]
-TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
-COMMANDS = ("reconstruct", "stream", "batch", "extend", "export", "overlay", "demo")
+README, CONTRIBUTING, DOCS = ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "docs"
+PAGES = [README, *sorted(DOCS.glob("*.md"))]
+ALL_PAGES = [*PAGES, CONTRIBUTING, ROOT / "CHANGELOG.md", ROOT / "benchmarks" / "README.md"]
+# The pages whose tables describe the options of each command.
+DESCRIBED = {
+    "reconstruct": ["command-line.md"],
+    "demo": ["command-line.md"],
+    "stream": ["command-line.md", "streaming.md"],
+    "batch": ["command-line.md", "films.md"],
+    "extend": ["image-sets.md"],
+    "export": ["export.md"],
+    "overlay": ["export.md"],
+}
+LARGEST_README = 12 * 1024
 FRAMES = 10
 FILES = {"trajectory.tum", "colmap", "points.ply", "summary.json", "report.html"}
+OPTION = r"(?<![\w-])--[a-z][a-z-]+"
 
 
 @dataclass(frozen=True)
 class Block:
-    """A fenced block: its language, its text and the line of the README on which that starts."""
+    """A fenced block of a page: its language, its text and the line on which that starts."""
 
+    page: Path
     language: str
     text: str
     line: int
 
 
-def blocks(language: str | None = None) -> list[Block]:
-    found = [
-        Block(match[1], match[2], TEXT.count("\n", 0, match.start(2)) + 1)
-        for match in re.finditer(r"^```(\w*)\n(.*?)^```$", TEXT, re.MULTILINE | re.DOTALL)
+def text_of(page: Path) -> str:
+    return page.read_text(encoding="utf-8")
+
+
+def blocks(page: Path) -> list[Block]:
+    text = text_of(page)
+    return [
+        Block(page, match[1], match[2], text.count("\n", 0, match.start(2)) + 1)
+        for match in re.finditer(r"^```(\w*)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
     ]
-    return [block for block in found if language in (None, block.language)]
 
 
 def each(language: str) -> pytest.MarkDecorator:
-    return pytest.mark.parametrize("block", [pytest.param(b, id=f"line {b.line}") for b in blocks(language)])
+    found = [block for page in PAGES for block in blocks(page) if block.language == language]
+    assert found
+    return pytest.mark.parametrize("block", [pytest.param(b, id=f"{b.page.name} line {b.line}") for b in found])
+
+
+def rows(text: str) -> list[list[str]]:
+    """The cells of all table rows."""
+    lines = re.findall(r"^\| ?(.*) \|$", text, re.MULTILINE)
+    return [[cell.strip().replace("\\|", "|") for cell in re.split(r"(?<!\\)\|", line)] for line in lines]
+
+
+def table(text: str, first_column: str) -> list[dict[str, str]]:
+    """The rows of the first table whose first column has this name, by column."""
+    body = re.search(rf"^\| {re.escape(first_column)} \|.*\n\|[-:| ]+\|\n((?:\|.*\n)*)", text, re.MULTILINE)
+    assert body, first_column
+    names, *_ = rows(body[0])
+    return [dict(zip(names, row, strict=True)) for row in rows(body[1])]
+
+
+# --- examples ---------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +103,7 @@ def material(tmp_path_factory: pytest.TempPathFactory) -> Path:
         cv2.imwrite(str(folder / "masks" / f"{index:06d}.png"), mask)
     for index, image in enumerate(render_shot("arc", frames=3, width=256, height=144, parallax=0.1).images[1:]):
         cv2.imwrite(str(folder / "stills" / f"still_{index}.png"), image)
-    (control,) = (block.text for block in blocks("json") if "poses" in block.text)
+    (control,) = (block.text for block in blocks(DOCS / "control.md") if block.language == "json")
     (folder / "control.json").write_text(control)
     brightness = helper.make_node("ReduceMean", ["image"], ["mean"], axes=[1], keepdims=1)
     nodes = [brightness, helper.make_node("Softplus", ["mean"], ["out"])]
@@ -126,7 +162,7 @@ def test_command(block: Block, place: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 @each("python")
 def test_python(block: Block, place: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code = compile("\n" * (block.line - 1) + block.text, str(ROOT / "README.md"), "exec")
+    code = compile("\n" * (block.line - 1) + block.text, str(block.page), "exec")
     names: dict[str, Any] = {"__name__": "__main__"}
     exec(code, names)
     if "reconstruction" in names:
@@ -137,82 +173,137 @@ def test_python(block: Block, place: Path, capsys: pytest.CaptureFixture[str]) -
 
 @each("json")
 def test_file(block: Block, tmp_path: Path) -> None:
-    (tmp_path / "camera.json").write_text(block.text)
+    (tmp_path / "file.json").write_text(block.text)
     if "poses" in block.text:
-        assert read_control(tmp_path / "camera.json").frames == ["0", "9", 0, 9]
+        assert read_control(tmp_path / "file.json").frames == ["0", "9", 0, 9]
         return
-    camera = read_camera(tmp_path / "camera.json")
+    camera = read_camera(tmp_path / "file.json")
     assert (camera.width, camera.height) == (320, 180)
     np.testing.assert_allclose(
         [camera.mean_focal_length(), camera.principal_point_x, camera.principal_point_y], [314, 160, 90]
     )
 
 
-def test_no_block_escapes() -> None:
-    assert {block.language for block in blocks()} == {"sh", "console", "python", "json"}
-    assert TEXT.count("```") == 2 * len(blocks())
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_no_block_escapes(page: Path) -> None:
+    run_by_ci = {"sh"} if page == README else set()
+    assert {block.language for block in blocks(page)} <= {"console", "python", "json"} | run_by_ci
+    assert text_of(page).count("```") == 2 * len(blocks(page))
+
+
+# --- commands and options ---------------------------------------------------------------------------------------
 
 
 def test_set_up_commands_are_those_of_ci() -> None:
     script = (ROOT / ".ci" / "run").read_text()
     assert os.access(ROOT / ".ci" / "run", os.X_OK)
-    demo, tests = (block.text.strip().split(" && ") for block in blocks("sh"))
-    assert demo[2:] == ["pip install .", "factorsfm demo"]
-    assert demo[:2] == tests[:2] == ["python3 -m venv .venv", ". .venv/bin/activate"]
-    assert tests[-1] in script.splitlines()
-    assert tests[2].removeprefix("pip install ") == "'.[test]'"
+    set_up, run = (block.text.splitlines() for block in blocks(README) if block.language == "sh")
+    assert set_up == ["python3 -m venv .venv && . .venv/bin/activate", "pip install '.[test]'"]
+    assert run[0] == "factorsfm demo"
     assert re.search(r"^pip install .*'\.\[test\]'$", script, re.MULTILINE)
     assert re.search(r"^factorsfm demo ", script, re.MULTILINE)
+    assert run[1] in script.splitlines()
+    assert f"\n{run[1]} " in text_of(CONTRIBUTING)
+
+
+def help_of(command: str, capsys: pytest.CaptureFixture[str]) -> str:
+    with pytest.raises(SystemExit):
+        cli.main([command, "--help"])
+    return capsys.readouterr().out
 
 
 def options_of(command: str, capsys: pytest.CaptureFixture[str]) -> set[str]:
-    with pytest.raises(SystemExit):
-        cli.main([command, "--help"])
-    return set(re.findall(r"(?<![\w-])--[a-z][a-z-]+", capsys.readouterr().out)) - {"--help", "--verbose"}
+    return set(re.findall(OPTION, help_of(command, capsys))) - {"--help", "--verbose"}
 
 
-def test_every_option_and_value_is_described(capsys: pytest.CaptureFixture[str]) -> None:
-    options = set().union(*(options_of(command, capsys) for command in COMMANDS))
-    assert len(options) > 20
-    assert set(re.findall(r"(?<![\w-])--[a-z][a-z-]+", TEXT)) == options
-    for value in (*PRESETS, *DepthKind, *ShotKind, *FrameStatus, *models.MODELS, *COMMANDS):
-        assert f"`{value}`" in TEXT
-    for status in (0, cli.BAD_INPUT, cli.NOT_RECONSTRUCTED, cli.INTERRUPTED):
-        assert f"\n| {status} | " in TEXT
+def described(pages: list[str]) -> dict[str, str]:
+    """The options in the first cells of the tables of some pages, with these cells."""
+    cells = [row[0] for page in pages for row in rows(text_of(DOCS / page))]
+    return {option: cell for cell in cells for option in re.findall(OPTION, cell)}
 
 
-@pytest.mark.parametrize(
-    ("heading", "commands"),
-    [("Streaming", ["reconstruct", "stream"]), ("Films", ["reconstruct", "batch"]), ("Export", ["export"])],
-)
-def test_a_section_names_the_options_of_its_command(
-    heading: str, commands: list[str], capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("command", DESCRIBED)
+def test_every_option_has_a_row_with_its_values(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    rows_of = described(DESCRIBED[command])
+    assert options_of(command, capsys) <= rows_of.keys()
+    for option, values in re.findall(rf"({OPTION}) \{{([^}}]+)\}}", help_of(command, capsys)):
+        if option != "--preset":  # has a table of its own
+            assert set(values.split(",")) <= set(re.split(r"[`| ]", rows_of[option])), option
+
+
+@pytest.mark.parametrize("page", sorted({page for pages in DESCRIBED.values() for page in pages}))
+def test_a_page_describes_no_option_that_its_commands_do_not_have(
+    page: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    section = TEXT.split(f"\n## {heading}\n")[1].split("\n## ")[0]
-    known = set().union(*(options_of(command, capsys) for command in commands))
-    named = set(re.findall(r"(?<![\w-])--[a-z][a-z-]+", section))
-    assert named <= known
-    assert options_of(commands[-1], capsys) - options_of(commands[0], capsys) <= named
+    own = set().union(*(options_of(command, capsys) for command, pages in DESCRIBED.items() if page == pages[-1]))
+    assert described([page]).keys() <= own
+
+
+def test_no_page_names_an_option_that_is_not_there(capsys: pytest.CaptureFixture[str]) -> None:
+    known = {"--help", "--version"}.union(*(options_of(command, capsys) for command in DESCRIBED))
+    assert len(known) > 30
+    for page in PAGES:
+        assert set(re.findall(OPTION, text_of(page))) <= known, page.name
+
+
+def test_every_command_value_and_status_is_described() -> None:
+    page = text_of(DOCS / "command-line.md")
+    assert [row["command"].strip("`") for row in table(page, "command")] == [
+        "reconstruct", "stream", "batch", "extend", "export", "overlay", "demo",
+    ]  # fmt: skip
+    assert set(DESCRIBED) == {row["command"].strip("`") for row in table(page, "command")}
+    for column, values in (("kind", ShotKind), ("status", FrameStatus), ("preset", PRESETS)):
+        assert {row[column].strip("`") for row in table(page, column)} == set(values)
+    assert {int(row["exit status"]) for row in table(page, "exit status")} == {
+        0, cli.BAD_INPUT, cli.NOT_RECONSTRUCTED, cli.INTERRUPTED,
+    }  # fmt: skip
+    priors = text_of(DOCS / "priors.md")
+    assert {row["kind"].strip("`") for row in table(priors, "kind")} == set(DepthKind)
+    assert all(f"`{name}`" in priors for name in models.MODELS)
 
 
 def test_the_formats_are_those_of_the_export() -> None:
-    rows = re.findall(r"^\| `([\w-]+)` \| a (file|folder): (.+) \| (\S+) \| (\S+) \| (\S+) \|$", TEXT, re.MULTILINE)
-    assert [name for name, *_ in rows] == list(FORMATS)
-    for name, kind, said, up, scale, first in rows:
-        chosen, defaults = FORMATS[name], FORMATS[name].defaults
-        assert (kind == "folder") == chosen.is_folder
-        assert up in (defaults.up_axis.value, "–")
-        assert scale in (f"{defaults.scale:g}", "–")
-        assert first in (str(defaults.first_frame), "–")
-        assert ("`vfx`" in said) == (name in ("usd", "stmap"))
-        assert ("`alembic`" in said) == (name == "alembic")
+    listed = table(text_of(DOCS / "export.md"), "format")
+    assert [row["format"].strip("`") for row in listed] == list(FORMATS)
+    for row, (name, chosen) in zip(listed, FORMATS.items(), strict=True):
+        kind = "a folder:" if chosen.is_folder else "a file:"
+        assert row["writes"].startswith(kind)
+        assert row["up axis"] in (chosen.defaults.up_axis.value, "–")
+        assert row["scale"] in (f"{chosen.defaults.scale:g}", "–")
+        assert row["first frame"] in (str(chosen.defaults.first_frame), "–")
+        assert ("`vfx`" in row["writes"]) == (name in ("usd", "stmap"))
+        assert ("`alembic`" in row["writes"]) == (name == "alembic")
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+# --- the README -------------------------------------------------------------------------------------------------
+
+
+def test_the_readme_is_read_in_one_sitting() -> None:
+    assert README.stat().st_size <= LARGEST_README
+
+
+@pytest.mark.parametrize("page", [README, DOCS / "command-line.md"], ids=lambda page: page.name)
+def test_the_files_of_a_result_are_listed(page: Path) -> None:
+    listed = {row["file"].split(",")[0].strip("`/") for row in table(text_of(page), "file")}
+    assert listed - {"part-002"} == FILES
+
+
+def test_the_figures_are_those_of_the_benchmarks() -> None:
+    results = text_of(ROOT / "benchmarks" / "results" / "RESULTS.md").split("\n### All shots\n")[1]
+    measured = {(row["method"], row["prior"]): row for row in table(results, "method")}
+    said = table(text_of(README), "method")
+    assert len(said) > 3
+    for row in said:
+        source = measured[row["method"], row["prior"]]
+        assert row == {name: source[name].strip("*") for name in row}
+
+
+# --- links and names --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("page", ALL_PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_lead_somewhere(page: Path) -> None:
-    text = page.read_text(encoding="utf-8")
-    targets = re.findall(r"\]\(([^)]+)\)", text)
-    assert targets or page.name != "README.md"
+    targets = re.findall(r"\]\(([^)]+)\)", text_of(page))
     for target in targets:
         if target.startswith("https://"):
             continue
@@ -220,5 +311,10 @@ def test_links_lead_somewhere(page: Path) -> None:
         other = (page.parent / name).resolve() if name else page
         assert other.exists(), target
         if anchor:
-            headings = re.findall(r"^#+ (.+)$", other.read_text(encoding="utf-8"), re.MULTILINE)
-            assert anchor in {re.sub(r"\W+", "-", heading.lower()).strip("-") for heading in headings}
+            headings = re.findall(r"^#+ (.+)$", text_of(other), re.MULTILINE)
+            assert anchor in {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}, target
+
+
+def test_every_page_is_linked_from_the_readme() -> None:
+    linked = set(re.findall(r"\]\(docs/([\w-]+\.md)", text_of(README)))
+    assert linked == {page.name for page in DOCS.glob("*.md")}
