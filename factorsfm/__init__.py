@@ -12,7 +12,8 @@ from factorsfm.control.known import Control, KnownDistance, KnownHeight, KnownPo
 from factorsfm.export.options import ExportOptions, UpAxis
 from factorsfm.frames.cuts import CutDetector, ShotUpdate, find_shots
 from factorsfm.frames.frame import Frame
-from factorsfm.frames.live_sources import RawFormat, Source, open_source
+from factorsfm.frames.live_sources import Source, open_source
+from factorsfm.frames.raw import RawFormat
 from factorsfm.frames.reading import read_frames
 from factorsfm.graph.explicit_graph import factor_graph
 from factorsfm.imagesets.add_images import add_images

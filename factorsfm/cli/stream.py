@@ -18,8 +18,9 @@ from typing import Any
 from factorsfm.api import check_matched, input_options
 from factorsfm.camera.files import camera_to_json, open_camera, read_camera
 from factorsfm.frames.frame import Frame
-from factorsfm.frames.live_sources import RawFormat, Source, open_source
+from factorsfm.frames.live_sources import Source, open_source
 from factorsfm.frames.ranges import parse_range
+from factorsfm.frames.raw import RawFormat
 from factorsfm.priors.depth import DepthPrior, open_depth
 from factorsfm.priors.masks import MaskPrior, open_masks
 from factorsfm.report.result_folder import check_directory, write_failure, write_folder

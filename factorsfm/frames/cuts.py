@@ -1,11 +1,8 @@
 """Shot boundaries, found while the frames arrive: hard cuts, fades through black or white, and dissolves.
 
-Blocks of a small grey copy of the last frame are looked up in the new one by normalised correlation, which a change of
-exposure leaves alone, in two ways: each on its own in its neighbourhood, and all with one common displacement in the
-whole image. An actor who passes close by disturbs the second, a fast pan the first, and a cut both.
-
-In a dissolve, every frame is nearly the last one. But a frame in its middle is a weighted sum of one before and one
-after, block by block, and neither of these alone comes close.
+A frame belongs to the shot while its dissimilarity to the last one stays below a threshold (`block_matching`). In a
+dissolve every frame is nearly the last one; but a frame in its middle is, block by block, a weighted sum of a frame
+before and a frame after it, and neither of these alone comes close.
 """
 
 from __future__ import annotations
@@ -19,43 +16,50 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.frames.block_matching import Thumbnail, dissimilarity, dissolve_variances
 from factorsfm.frames.frame import Frame
-from factorsfm.frames.likeness import View, blend, dissimilarity
 from factorsfm.frames.reading import read_frames
 from factorsfm.support.errors import InputError
 
-_BLANK = 0.1  # share of the blocks with texture; with less the frame is black, white or flat
+_BLANK_SHARE = 0.1  # share of the blocks with texture, below which a frame is black, white or flat
 
-_CUT = 0.12  # dissimilarity that no motion of a camera reaches between two frames of a video ...
-_ABOVE_MEDIAN = 3.0  # ... and how many times that of the frames before, where the motion is always large
-_HISTORY = 12  # frames
-_DARK = 12  # blank frames after which a moving camera makes twice the difference
-_CLEAR, _CLEAR_SHARE = 8.0, 0.5  # contrast of what is compared: grey levels, or a share of the highest not long before
-_FADED = 4.0  # contrast, grey levels, of a view that shows too little to be compared unless the others are like it ...
-_FADE = 12  # ... for as many frames at most
-_INTERRUPTION = 4  # frames; where the view is back after no more than these, it was a flash or a damaged frame
+# Hard cuts: the dissimilarity that camera motion does not reach between two frames.
+_CUT_DISSIMILARITY = 0.12
+_CUT_TIMES_MEDIAN = 3.0  # the same as a multiple of the median of the last frames, if their motion is large
+_HISTORY_FRAMES = 12  # of that median
+_DOUBLING_FRAMES = 12  # gap after which the threshold is twice as large, because the camera moves on meanwhile
 
-_SPANS = (4, 8)  # frames from the middle of a dissolve to what is compared before and after
-_APART = 0.2  # dissimilarity of these two
-_ALONE, _TOGETHER = 0.9, 0.85  # variance that one of them may explain at most, and both must explain at least ...
-_LEFT = 0.3  # ... so that this share of what one leaves, at most, is left by both
-_CONFIRMED = 2  # frames in a row that say so
-_SETTLED = 0.03  # dissimilarity to the frame four before, when the dissolve is over ...
-_DISSOLVE = 12  # ... or after so many frames
+# Fades: frames of low contrast are not compared.
+_FULL_CONTRAST = 8.0  # grey levels: enough for a frame to be compared with
+_FULL_CONTRAST_SHARE = 0.5  # of the highest contrast of the last frames: also enough
+_FADED_CONTRAST = 4.0  # grey levels, below which a frame is faded if the frames before had more contrast
+_FADE_FRAMES = 12  # longest fade; after it, a frame of low contrast is compared
+
+_INTERRUPTION_FRAMES = 4  # if the view is back after no more frames than these, they were a flash or damaged
+
+# Dissolves.
+_SPANS = (4, 8)  # frames from the middle of a dissolve to the two frames that blend in it
+_ENDS_DISSIMILARITY = 0.2  # least dissimilarity of these two
+_MOST_ALONE = 0.9  # largest share of variance that one of them explains alone
+_LEAST_TOGETHER = 0.85  # smallest share that both explain together
+_REST_RATIO = 0.3  # largest ratio of what both leave unexplained to what one alone leaves
+_CONFIRMATIONS = 2  # frames in a row that must show a dissolve
+_SETTLED_DISSIMILARITY = 0.03  # to the frame four before, below which the dissolve is over
+_DISSOLVE_FRAMES = 12  # after which it is over in any case
 
 
 @dataclass(frozen=True, slots=True)
 class ShotUpdate:
-    """What a frame is to the shots.
+    """The shot of a frame.
 
     Attributes:
-        index: frames pushed before this one.
-        shot: number of the shot that the frame belongs to, from 0; None where it is blank or nearly, or shows two in
-            the second half of a dissolve. A new shot has a number of its own. After an interruption of at most four
-            frames the old number comes back, and the number that the interruption had is void.
+        index: number of frames pushed before this one.
+        shot: number of the frame's shot, from 0. None if the frame is blank or faded, or in the second half of a
+            dissolve. Every new shot takes the next number. If the old view is back after at most four other frames, so
+            is its number, and the number of these frames is void.
         starts: whether this is the first frame of a new shot.
-        dissimilarity: to the last frame that was not blank, about 0 to 1; NaN where there is nothing to compare.
-        reason: one sentence on a beginning, a return or a frame without a shot; empty where the shot just goes on.
+        dissimilarity: to the last frame that was not blank, about 0 to 1; NaN if there is nothing to compare.
+        reason: one sentence if the shot starts or comes back, or if the frame has none; otherwise empty.
     """
 
     index: int
@@ -67,54 +71,59 @@ class ShotUpdate:
 
 @dataclass(slots=True)
 class _Shot:
-    number: int
-    end: int  # its last frame
-    history: deque[float] = field(default_factory=lambda: deque(maxlen=_HISTORY))
-    recent: deque[View] = field(default_factory=lambda: deque(maxlen=2 * max(_SPANS) + 1))  # without a gap
-    blended: int = 0  # frames in a row that end a dissolve
-    dissolving: int = 0  # frames since a dissolve is certain
+    """A shot so far: its number, its last frame, the dissimilarities and thumbnails of the last frames."""
 
-    def clear(self) -> tuple[View, int]:
-        """The newest view that has not faded, and how many frames came since."""
-        contrasts = [view.contrast for view in self.recent]
-        enough = min(_CLEAR, _CLEAR_SHARE * max(contrasts))
+    number: int
+    end: int
+    history: deque[float] = field(default_factory=lambda: deque(maxlen=_HISTORY_FRAMES))
+    recent: deque[Thumbnail] = field(default_factory=lambda: deque(maxlen=2 * max(_SPANS) + 1))  # without a gap
+    blended: int = 0  # frames in a row that show a dissolve
+    dissolving: int = 0  # frames since a dissolve was confirmed
+
+    def reference(self) -> tuple[Thumbnail, int]:
+        """The newest thumbnail of full contrast, and the number of frames since."""
+        contrasts = [thumbnail.contrast for thumbnail in self.recent]
+        enough = min(_FULL_CONTRAST, _FULL_CONTRAST_SHARE * max(contrasts))
         place = max(k for k, contrast in enumerate(contrasts) if contrast >= enough)
         return self.recent[place], len(contrasts) - 1 - place
 
     def threshold(self, gap: int) -> float:
-        """Largest dissimilarity of a frame that goes on with the shot after `gap` others."""
-        usual = _ABOVE_MEDIAN * statistics.median(self.history) if self.history else 0.0
-        return max(_CUT, usual) * (1.0 + min(gap / _DARK, 1.0))
+        """Largest dissimilarity of a frame of the same shot, `gap` frames after the one it is compared with."""
+        usual = _CUT_TIMES_MEDIAN * statistics.median(self.history) if self.history else 0.0
+        return max(_CUT_DISSIMILARITY, usual) * (1.0 + min(gap / _DOUBLING_FRAMES, 1.0))
 
     def is_dissolving(self) -> bool:
-        """Whether some frame not long ago was a blend of others, or the view still changes since."""
+        """Whether a dissolve is confirmed by the newest frames, or was confirmed and is not over."""
         if self.dissolving:
-            return (
-                self.dissolving < _DISSOLVE and dissimilarity(self.recent[-1 - min(_SPANS)], self.recent[-1]) > _SETTLED
-            )
-        self.blended = self.blended + 1 if any(map(self._shows_blend, _SPANS)) else 0
-        return self.blended >= _CONFIRMED
+            before, newest = self.recent[-1 - min(_SPANS)], self.recent[-1]
+            return self.dissolving < _DISSOLVE_FRAMES and dissimilarity(before, newest) > _SETTLED_DISSIMILARITY
+        self.blended = self.blended + 1 if any(map(self._is_blend, _SPANS)) else 0
+        return self.blended >= _CONFIRMATIONS
 
-    def _shows_blend(self, span: int) -> bool:
+    def _is_blend(self, span: int) -> bool:
+        """Whether the frame `span` frames ago is a blend of the newest frame and of the one 2 `span` frames ago."""
         if len(self.recent) <= 2 * span:
             return False
         first, middle, last = (self.recent[-1 - back] for back in (2 * span, span, 0))
-        if dissimilarity(first, last) < _APART:
+        if dissimilarity(first, last) < _ENDS_DISSIMILARITY:
             return False
-        alone, together = blend(first, middle, last)
-        return alone < _ALONE and together > _TOGETHER and 1.0 - together < _LEFT * (1.0 - alone)
+        alone, together = dissolve_variances(first, middle, last)
+        return alone < _MOST_ALONE and together > _LEAST_TOGETHER and 1.0 - together < _REST_RATIO * (1.0 - alone)
 
 
 class CutDetector:
     """Finds the shots of a video frame by frame, without looking ahead and in bounded memory.
 
-    Found are hard cuts, fades through black or white: the shot ends where the image has gone blank, the next begins
-    where there is something to see again; and dissolves of about six frames to a second: the shot ends in the middle,
-    the next begins when the view has settled. A black or blown-out stretch with the same view before and after is no
-    cut, nor are up to four frames of something else. Not found are dissolves while the camera moves fast, wipes, and
-    cuts to almost the same view. Taken for cuts are jumps of more than about a tenth of the image from frame to frame,
-    and somebody who fills half of it within a few frames. Frames must come from a video: photographs taken far apart
-    differ as much as two shots do.
+    It finds hard cuts; fades through black or white, where the shot ends at the first blank frame and the next begins
+    at the first frame that shows something; and dissolves of about six frames to a second, where the shot ends in the
+    middle and the next begins when the view no longer changes.
+
+    A black or blown-out stretch with the same view before and after it is no cut, nor are up to four frames of
+    something else.
+
+    It misses dissolves while the camera moves fast, wipes, and cuts to almost the same view. It takes a jump of more
+    than about a tenth of the image for a cut, and a person who fills half of the image within a few frames. Photographs
+    taken far apart differ as much as two shots do, so frames must come from a video.
 
     Example:
         >>> detector = CutDetector()
@@ -128,7 +137,7 @@ class CutDetector:
         self._shots = 0
         self._size: tuple[int, ...] = ()
         self._shot: _Shot | None = None
-        self._interrupted: _Shot | None = None  # the shot before, while it may still come back
+        self._interrupted: _Shot | None = None  # the shot before, while its view may come back
 
     def push(self, frame: Frame | NDArray[np.uint8]) -> ShotUpdate:
         """Take the next frame.
@@ -145,50 +154,63 @@ class CutDetector:
             raise InputError(f"frame {self._pushed} has shape {size}, expected {self._size} as the frames before")
         self._size = size
         index, self._pushed = self._pushed, self._pushed + 1
-        view = View.of(image)
-        textured, blocks = int(view.textured.sum()), len(view.textured)
-        if textured < _BLANK * blocks:
+        thumbnail = Thumbnail.of(image)
+        textured, blocks = int(thumbnail.textured.sum()), len(thumbnail.textured)
+        if textured < _BLANK_SHARE * blocks:
             return ShotUpdate(index, None, False, float("nan"), f"blank: {textured} of {blocks} blocks show texture")
-        if self._has_faded(index, view):
-            return ShotUpdate(index, None, False, float("nan"), f"faded: contrast {view.contrast:.1f} grey levels")
+        if self._has_faded(index, thumbnail):
+            reason = f"faded: contrast {thumbnail.contrast:.1f} grey levels"
+            return ShotUpdate(index, None, False, float("nan"), reason)
         if self._shot is None:
-            return self._begin(index, view, float("nan"), "first frame that shows something")
-        return self._compare(index, view, self._shot)
+            return self._begin(index, thumbnail, float("nan"), "first frame that shows something")
+        return self._compare(index, thumbnail, self._shot)
 
-    def _has_faded(self, index: int, view: View) -> bool:
-        """Whether too little is left, or back, to tell whether it is the same view."""
+    def _has_faded(self, index: int, thumbnail: Thumbnail) -> bool:
+        """Whether the contrast is too low, beside that of the shot, to compare the views."""
         shot = self._shot
-        if shot is None or view.contrast >= _FADED or index - shot.end > _FADE:
+        if shot is None or thumbnail.contrast >= _FADED_CONTRAST or index - shot.end > _FADE_FRAMES:
             return False
-        return view.contrast < _CLEAR_SHARE * shot.clear()[0].contrast
+        return thumbnail.contrast < _FULL_CONTRAST_SHARE * shot.reference()[0].contrast
 
-    def _compare(self, index: int, view: View, shot: _Shot) -> ShotUpdate:
-        if (before := self._interrupted) is not None:
-            gap = index - before.end - 1
-            reference, age = before.clear()
-            if gap > _INTERRUPTION:
-                self._interrupted = None
-            elif (back := dissimilarity(reference, view)) < before.threshold(gap + age):
-                before.end = index
-                before.recent.clear()
-                before.recent.append(view)
-                self._shot, self._interrupted = before, None
-                return ShotUpdate(index, before.number, False, back, f"the view is back after {gap} other frames")
+    def _compare(self, index: int, thumbnail: Thumbnail, shot: _Shot) -> ShotUpdate:
+        if (returned := self._resume(index, thumbnail)) is not None:
+            return returned
         gap = index - shot.end - 1
-        reference, age = shot.clear()
-        difference, threshold = dissimilarity(reference, view), shot.threshold(gap + age)
+        reference, age = shot.reference()
+        difference, threshold = dissimilarity(reference, thumbnail), shot.threshold(gap + age)
         if difference < threshold:
-            return self._go_on(index, view, shot, difference, gap)
+            return self._go_on(index, thumbnail, shot, difference, gap)
         self._interrupted = self._interrupted or shot
         kind = f"another view after {gap} blank frames" if gap else "hard cut"
-        return self._begin(index, view, difference, f"{kind}: dissimilarity {difference:.2f}, limit {threshold:.2f}")
+        reason = f"{kind}: dissimilarity {difference:.2f}, limit {threshold:.2f}"
+        return self._begin(index, thumbnail, difference, reason)
 
-    def _go_on(self, index: int, view: View, shot: _Shot, difference: float, gap: int) -> ShotUpdate:
+    def _resume(self, index: int, thumbnail: Thumbnail) -> ShotUpdate | None:
+        """Go on with the shot before, if there is an interruption and its view is back; None if it is not."""
+        before = self._interrupted
+        if before is None:
+            return None
+        gap = index - before.end - 1
+        reference, age = before.reference()
+        if gap > _INTERRUPTION_FRAMES:
+            self._interrupted = None
+            return None
+        difference = dissimilarity(reference, thumbnail)
+        if difference < before.threshold(gap + age):
+            before.end = index
+            before.recent.clear()
+            before.recent.append(thumbnail)
+            self._shot, self._interrupted = before, None
+            return ShotUpdate(index, before.number, False, difference, f"the view is back after {gap} other frames")
+        return None
+
+    def _go_on(self, index: int, thumbnail: Thumbnail, shot: _Shot, difference: float, gap: int) -> ShotUpdate:
+        """Add the frame to the shot, and look for a dissolve that ends it."""
         shot.history.append(difference)
         shot.end = index
         if gap:
             shot.recent.clear()
-        shot.recent.append(view)
+        shot.recent.append(thumbnail)
         if gap:
             return ShotUpdate(index, shot.number, False, difference, f"the view is back after {gap} blank frames")
         if shot.is_dissolving():
@@ -196,32 +218,33 @@ class CutDetector:
             return ShotUpdate(index, None, False, difference, "dissolve: the last frames blend two views")
         if shot.dissolving:
             self._interrupted = None
-            return self._begin(index, view, difference, f"dissolve: the view has changed {shot.dissolving} frames ago")
+            reason = f"dissolve: the view has changed {shot.dissolving} frames ago"
+            return self._begin(index, thumbnail, difference, reason)
         return ShotUpdate(index, shot.number, False, difference)
 
-    def _begin(self, index: int, view: View, difference: float, reason: str) -> ShotUpdate:
+    def _begin(self, index: int, thumbnail: Thumbnail, difference: float, reason: str) -> ShotUpdate:
         self._shot = _Shot(self._shots, index)
-        self._shot.recent.append(view)
+        self._shot.recent.append(thumbnail)
         self._shots += 1
         return ShotUpdate(index, self._shot.number, True, difference, reason)
 
 
 def find_shots(source: str | Path | Iterable[Frame | NDArray[np.uint8]], frames: slice | None = None) -> list[range]:
-    """Shots of a video, each as the range of its frames, blank ones at either end left out.
+    """The shots of a video, each as the range of its frames; blank frames at either end are left out.
 
     Args:
-        source, frames: as in `read_frames`; the ranges count in the source.
+        source, frames: as in `read_frames`; the ranges count frames of the source.
 
     Raises:
         InputError: the source cannot be read.
     """
     detector = CutDetector()
-    ends: dict[int, tuple[int, int]] = {}  # first and last frame by number
+    ends: dict[int, tuple[int, int]] = {}  # first and last frame, by the number of the shot
     for frame in read_frames(source, frames):
         shot = detector.push(frame).shot
         if shot is None:
             continue
         first = ends[shot][0] if shot in ends else frame.index
-        ends = {number: pair for number, pair in ends.items() if number <= shot}  # the later ones were interruptions
+        ends = {number: pair for number, pair in ends.items() if number <= shot}  # later numbers are now void
         ends[shot] = (first, frame.index)
     return [range(first, last + 1) for _, (first, last) in sorted(ends.items())]

@@ -1,4 +1,4 @@
-"""Image files and the folders that hold them, complete or still being filled."""
+"""Image files, and folders of them that are complete or still being filled."""
 
 from __future__ import annotations
 
@@ -21,19 +21,20 @@ from factorsfm.support.errors import InputError
 logger = logging.getLogger(__name__)
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"})
-_JPEG_MARKER = re.compile(rb"\xff+([^\x00\xff\xd0-\xd7])", re.DOTALL)  # neither stuffing nor a restart
-_PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
-_POLL_SECONDS = 0.1  # between two looks at a folder that is being filled
-_PATIENCE_SECONDS = 2.0  # an image that has not changed for so long and still cannot be decoded is damaged
+_JPEG_START, _JPEG_END = b"\xff\xd8", b"\xd9"
+_JPEG_MARKER = re.compile(rb"\xff+([^\x00\xff\xd0-\xd7])", re.DOTALL)  # without stuffed bytes and restart markers
+_PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
+_POLL_SECONDS = 0.1  # between two listings of a folder that is being filled
+_PATIENCE_SECONDS = 2.0  # a file that has not changed for so long and cannot be decoded is damaged
 
 
 def list_images(folder: Path) -> list[Path]:
-    """Images of a folder in natural order, img2 before img10; none is no error."""
+    """Images of a folder in natural order (img2 before img10); an empty list if there are none."""
     return list_files(folder, IMAGE_SUFFIXES)
 
 
 def list_files(folder: Path, suffixes: Collection[str]) -> list[Path]:
-    """Files of a folder with one of these suffixes (lower case) in natural order; none is no error."""
+    """Files of a folder with one of these suffixes (lower case) in natural order, without hidden files."""
     found = [
         path
         for path in folder.iterdir()
@@ -48,24 +49,26 @@ def _natural_key(path: Path) -> tuple[list[str | int], str]:
 
 
 def watch_folder(folder: Path, end_file: str | Path | None, closed: threading.Event) -> Iterator[Frame]:
-    """Images of a folder that is still being filled, each once it is complete.
+    """Images of a folder that is still being filled, in natural order, each once it is complete.
+
+    An image that cannot be decoded, or that appears after a later one was taken, is left out with a warning.
 
     Args:
-        end_file: when it exists (a name in the folder, or a path) nothing further comes.
-        closed: set by another thread when nobody wants further frames.
+        end_file: when this file exists (a name in the folder, or a path), the folder is complete.
+        closed: set by another thread when no further frames are wanted.
     """
     taken: set[str] = set()
     last: Path | None = None
     arrivals: dict[Path, _Arrival] = {}
     index = 0
     while not closed.is_set():
-        complete = end_file is not None and (folder / end_file).exists()  # before the look: nothing comes after it
+        complete = end_file is not None and (folder / end_file).exists()  # tested before the folder is listed
         waiting = [path for path in list_images(folder) if path.name not in taken]
         arrivals = {path: _Arrival.seen(path, arrivals.get(path)) for path in waiting}
         for path, arrival in arrivals.items():
             late = last is not None and _natural_key(path) < _natural_key(last)
             image = None if late else arrival.image(path)
-            if image is None and not late and not arrival.given_up():
+            if image is None and not late and not arrival.is_damaged():
                 break
             taken.add(path.name)
             if image is None:
@@ -83,7 +86,13 @@ def watch_folder(folder: Path, end_file: str | Path | None, closed: threading.Ev
 
 @dataclass(frozen=True, slots=True)
 class _Arrival:
-    """A file as it was at a look at the folder; `since` is when it was first seen like this."""
+    """A file at one listing of the folder.
+
+    Attributes:
+        state: its size and time of change; None if it is gone.
+        since: monotonic time at which it was first seen in this state, seconds.
+        settled: whether it was in this state at the listing before.
+    """
 
     state: tuple[int, int] | None
     since: float
@@ -93,7 +102,7 @@ class _Arrival:
     def seen(path: Path, before: _Arrival | None) -> _Arrival:
         try:
             status = path.stat()
-        except OSError:  # renamed or removed since the look
+        except OSError:  # renamed or removed after the listing
             return _Arrival(None, time.monotonic(), False)
         state = (status.st_size, status.st_mtime_ns)
         if before is None or before.state != state:
@@ -101,7 +110,7 @@ class _Arrival:
         return _Arrival(state, before.since, True)
 
     def image(self, path: Path) -> NDArray[np.uint8] | None:
-        """None as long as the file is not complete."""
+        """The image, None while the file is not complete."""
         if not self.settled:
             return None
         try:
@@ -109,22 +118,23 @@ class _Arrival:
         except InputError:
             return None
 
-    def given_up(self) -> bool:
+    def is_damaged(self) -> bool:
+        """Whether a file that cannot be decoded has not changed for so long that nothing more is to come."""
         return time.monotonic() - self.since > _PATIENCE_SECONDS
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
-    """(h, w, 3) BGR.
+    """An image file as (h, w, 3) uint8 BGR.
 
     Raises:
-        InputError: the file is missing, damaged, truncated or no image.
+        InputError: the file is missing, damaged, truncated or not an image.
     """
     try:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"image {path} cannot be read: {error.strerror}") from error
-    # Both before decoding: libjpeg fills the rest with grey, and libpng complains on stderr, past all logging.
-    if (data.startswith(b"\xff\xd8") and _jpeg_is_truncated(data)) or (data.startswith(_PNG) and _PNG_END not in data):
+    # Checked before decoding: libjpeg would fill the rest with grey, libpng would write to stderr, past all logging.
+    if _is_truncated(data):
         raise InputError(f"image {path} is truncated")
     with quiet_opencv():
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
@@ -136,11 +146,15 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     return np.asarray(image, dtype=np.uint8)
 
 
-def _jpeg_is_truncated(data: bytes) -> bool:
-    """Whether the end marker is missing."""
-    position = 2
+def _is_truncated(data: bytes) -> bool:
+    """Whether a JPEG or PNG file lacks its end marker."""
+    if data.startswith(_PNG_START):
+        return _PNG_END not in data
+    if not data.startswith(_JPEG_START):
+        return False
+    position = len(_JPEG_START)
     while marker := _JPEG_MARKER.search(data, position):
-        if marker[1] == b"\xd9":
+        if marker[1] == _JPEG_END:
             return False
-        position = marker.end() + int.from_bytes(data[marker.end() : marker.end() + 2], "big")
+        position = marker.end() + int.from_bytes(data[marker.end() : marker.end() + 2], "big")  # skip the segment
     return True

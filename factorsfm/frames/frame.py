@@ -1,4 +1,4 @@
-"""A frame: an image with its place in the source."""
+"""A frame: an image and its position in the source."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ class Frame:
     """One image of a shot.
 
     Attributes:
-        index: position in the source, counted from 0 before any range or step is applied.
+        index: position in the source, from 0, before any range or step is applied.
         image: (h, w, 3) uint8, BGR.
         name: file name, or the zero-padded index for videos and iterables.
-        timestamp: seconds from the start of the video, None where unknown.
-        dropped: frames of a live source that were skipped right before this one, because nobody was ready for them.
-        path: the image file, whose EXIF data may tell the lens; None where there is none.
+        timestamp: seconds from the start of the video, None if unknown.
+        dropped: number of frames of a live source that were dropped right before this one.
+        path: the image file, whose EXIF data may hold the focal length; None if the frame is not from an image file.
     """
 
     index: int
@@ -36,10 +36,10 @@ def bgr_image(image: object, index: int) -> NDArray[np.uint8]:
     """(h, w, 3) uint8 from a grey, BGR or BGRA image of 8 or 16 bits.
 
     Args:
-        index: of the frame, for the message.
+        index: of the frame, for the error message.
 
     Raises:
-        InputError: it is no such image.
+        InputError: another type, shape or number of bits.
     """
     if not isinstance(image, np.ndarray) or image.dtype not in (np.uint8, np.uint16):
         found = f"an array of {image.dtype}" if isinstance(image, np.ndarray) else f"of type {type(image).__name__}"
@@ -54,10 +54,10 @@ def bgr_image(image: object, index: int) -> NDArray[np.uint8]:
 
 
 def as_frame(frame: Frame | NDArray[np.uint8], index: int) -> Frame:
-    """A frame with a BGR image; an image alone becomes the frame number `index`.
+    """The frame, its image converted to 8-bit BGR; a bare image becomes frame number `index`.
 
     Raises:
-        InputError: it is no image.
+        InputError: the image has another type, shape or number of bits, see `bgr_image`.
     """
     if not isinstance(frame, Frame):
         frame = Frame(index, frame, f"{index:06d}", None)

@@ -1,90 +1,45 @@
-"""Sources of frames, read beside their consumer: files, folders that fill, cameras, networks, pipes, iterables."""
+"""Sources of frames that are read in a thread of their own, beside the consumer.
+
+A source is a video file, a folder of images (also one that is still being filled), a camera, a network stream, a pipe
+of raw frames, or an iterable of images.
+"""
 
 from __future__ import annotations
 
 import io
 import itertools
 import logging
-import re
-import select
 import sys
 import threading
-import time
 import weakref
 from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, BinaryIO, Literal, TypeGuard, cast
-from urllib.parse import urlsplit
+from typing import BinaryIO, Literal, TypeGuard, cast
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.frames.capture import (
+    camera_number,
+    captured_frames,
+    open_camera_device,
+    open_network_stream,
+    without_secrets,
+)
 from factorsfm.frames.folders import list_images, watch_folder
-from factorsfm.frames.frame import Frame, bgr_image
+from factorsfm.frames.frame import Frame
 from factorsfm.frames.ranges import checked_range
+from factorsfm.frames.raw import RawFormat, raw_frames
 from factorsfm.frames.reading import read_frames, uniform
 from factorsfm.frames.unordered import Unusable, read_images
-from factorsfm.frames.video import quiet_opencv
 from factorsfm.support.context import Closing
 from factorsfm.support.errors import FactorsfmError, InputError
 
 logger = logging.getLogger(__name__)
 
-_POLL_SECONDS = 0.1  # between two looks whether anybody still wants what a pipe gives
-_JOIN_SECONDS = 1.0
-
-_BYTES_PER_PIXEL = {"bgr24": 3.0, "rgb24": 3.0, "gray8": 1.0, "yuv420p": 1.5, "nv12": 1.5}
-_YUV = {"yuv420p": cv2.COLOR_YUV2BGR_I420, "nv12": cv2.COLOR_YUV2BGR_NV12}
-
-
-@dataclass(frozen=True, slots=True)
-class RawFormat:
-    """Frames without any container, one after another.
-
-    Attributes:
-        width, height: pixels; even for yuv420p and nv12.
-        pixels: bgr24, rgb24, gray8, yuv420p (also known as I420) or nv12, as FFmpeg names them.
-
-    Raises:
-        InputError: there is no such format.
-    """
-
-    width: int
-    height: int
-    pixels: str = "bgr24"
-
-    def __post_init__(self) -> None:
-        if self.pixels not in _BYTES_PER_PIXEL:
-            raise InputError(f'pixel format "{self.pixels}" is not one of {", ".join(_BYTES_PER_PIXEL)}')
-        if self.width < 1 or self.height < 1:
-            raise InputError(f"raw frames of {self.width}x{self.height} pixels hold nothing")
-        if self.pixels in _YUV and (self.width % 2 or self.height % 2):
-            raise InputError(f"raw frames of {self.width}x{self.height} pixels: {self.pixels} needs even numbers")
-
-    @classmethod
-    def parse(cls, text: str) -> RawFormat:
-        """From ``WIDTHxHEIGHT:PIXELS``, e.g. ``960x540:yuv420p``."""
-        match = re.fullmatch(r"(\d+)x(\d+):(\w+)", text.strip(), re.ASCII)
-        if match is None:
-            raise InputError(f'raw format "{text}" is not WIDTHxHEIGHT:PIXELS, for example 960x540:bgr24')
-        return cls(int(match[1]), int(match[2]), match[3])
-
-    @property
-    def frame_bytes(self) -> int:
-        """Size of one frame, bytes."""
-        return int(self.width * self.height * _BYTES_PER_PIXEL[self.pixels])
-
-    def image(self, data: bytes | bytearray) -> NDArray[np.uint8]:
-        """(height, width, 3) BGR from the bytes of one frame."""
-        values = np.frombuffer(data, np.uint8)
-        if self.pixels in _YUV:
-            planes = values.reshape(self.height * 3 // 2, self.width)
-            return np.asarray(cv2.cvtColor(planes, _YUV[self.pixels]), np.uint8)
-        image = values.reshape(self.height, self.width, -1)
-        return bgr_image(image[:, :, ::-1] if self.pixels == "rgb24" else image, 0)
+_JOIN_SECONDS = 1.0  # how long `Source.close` waits for the reading thread
 
 
 def open_source(
@@ -102,20 +57,20 @@ def open_source(
 
     Args:
         source: a video file, a folder of images or an iterable, as in `read_frames`, but damaged images of a folder
-            are left out; a camera (its number, or "camera:0"); the URL of a network stream (anything with "://"); "-"
-            for standard input, or a binary file object, of raw frames.
-        frames: the part to read; the indices of the frames count in the source.
+            are left out; a camera (its number, or "camera:0"); the URL of a network stream (anything with "://"); raw
+            frames from standard input ("-") or a binary file object.
+        frames: the range to read; frames keep their index in the source.
         raw: size and pixel format of raw frames.
-        watch: wait for further images in a folder. They are taken in natural order, each once it is complete; one that
-            appears after a later one was taken is left out.
-        end_file: with `watch`: the folder is complete when this file exists (a name in the folder, or a path).
-        drop: where the consumer is slower, True drops the frames that have waited longest, False waits; None drops
-            for cameras and network streams only.
-        queue_size: frames that may wait for the consumer.
-        stall_seconds: a source without a new frame for so long has ended; None waits for ever.
+        watch: whether to wait for further images in a folder. They are taken in natural order, each once it is
+            complete; one that appears after a later one was taken is left out.
+        end_file: with `watch`, the folder is complete when this file exists (a name in the folder, or a path).
+        drop: what happens when the consumer is too slow. True drops the frames that have waited longest, False makes
+            the source wait, None drops for cameras and network streams only.
+        queue_size: most frames that wait for the consumer.
+        stall_seconds: a source that gives no new frame for this long has ended; None waits for ever.
 
     Raises:
-        InputError: the source is missing, cannot be opened, or an argument contradicts it.
+        InputError: the source does not exist or cannot be opened, or an argument contradicts it.
     """
     if queue_size < 1 or (stall_seconds is not None and stall_seconds <= 0):
         raise InputError(f"queue_size is {queue_size} and stall_seconds {stall_seconds}; positive numbers are expected")
@@ -124,38 +79,78 @@ def open_source(
     if end_file is not None and not watch:
         raise InputError(f"end file {end_file} has no meaning unless a folder is watched")
     closed = threading.Event()
-    live = False
-    if watch:
-        if not isinstance(source, str | Path) or not Path(source).is_dir():
-            raise InputError(f"{source} cannot be watched; a folder that exists is expected")
-        name, found = f"folder {source}", watch_folder(Path(source), end_file, closed)
-    elif (camera := _camera_number(source)) is not None:
-        name, live = f"camera {camera}", True
-        found = _captured(_open_device(name, camera), name, closed)
-    elif isinstance(source, str) and "://" in source:
-        name, live = _without_secrets(source), True
-        found = _captured(_open_device(name, source, cv2.CAP_FFMPEG, _timeouts(stall_seconds)), name, closed)
-    elif _is_raw(source):
-        name = "standard input" if source == "-" else "the raw stream"
-        if raw is None:
-            raise InputError(f"{name} holds raw frames; their size and pixel format must be given")
-        if isinstance(source, io.TextIOBase):
-            raise InputError(f"{name} was opened as text; a binary file is expected")
-        found = _raw_frames(sys.stdin.buffer if source == "-" else source, raw, name, closed)
-    elif isinstance(source, str | Path) and Path(source).is_dir() and list_images(Path(source)):
-        name, part = str(source), checked_range(frames if frames is not None else slice(None))
-        found, frames = uniform(_readable(read_images(source, part)), name, part.start), None  # it skips, too
-    else:
-        name = str(source) if isinstance(source, str | Path) else "the sequence of images"
-        files = cast("str | Path | Iterable[NDArray[np.uint8] | NDArray[np.uint16] | Frame]", source)
-        found, frames = read_frames(files, frames), None  # it skips without decoding
     selection = checked_range(frames if frames is not None else slice(None))
-    chosen = uniform(_chosen(found, selection), name, selection.start)
-    return Source(chosen, name, closed, live if drop is None else drop, queue_size, stall_seconds)
+    if watch:
+        opened = _watch(source, end_file, closed)
+    elif _is_raw(source):
+        opened = _open_raw(source, raw, closed)
+    else:
+        opened = _open_device(source, stall_seconds, closed) or _open_files(source, selection)
+    chosen = opened.frames if opened.is_selected else _selected(opened.frames, selection)
+    same_size = uniform(chosen, opened.name, selection.start)
+    return Source(same_size, opened.name, closed, opened.is_live if drop is None else drop, queue_size, stall_seconds)
+
+
+@dataclass(frozen=True, slots=True)
+class _Opened:
+    """An open source.
+
+    Attributes:
+        name: for messages, without passwords.
+        frames: its frames, all of them or those of the range.
+        is_live: whether frames are lost if nobody takes them in time.
+        is_selected: whether `frames` are those of the range; files skip the others without decoding them.
+    """
+
+    name: str
+    frames: Iterator[Frame]
+    is_live: bool = False
+    is_selected: bool = False
+
+
+def _watch(source: object, end_file: str | Path | None, closed: threading.Event) -> _Opened:
+    if not isinstance(source, str | Path) or not Path(source).is_dir():
+        raise InputError(f"{source} cannot be watched; a folder that exists is expected")
+    return _Opened(f"folder {source}", watch_folder(Path(source), end_file, closed))
+
+
+def _open_device(source: object, stall_seconds: float | None, closed: threading.Event) -> _Opened | None:
+    """A camera or network stream; None if the source names neither."""
+    if (number := camera_number(source)) is not None:
+        name = f"camera {number}"
+        capture = open_camera_device(number, name)
+    elif isinstance(source, str) and "://" in source:
+        name = without_secrets(source)
+        capture = open_network_stream(source, name, stall_seconds)
+    else:
+        return None
+    return _Opened(name, captured_frames(capture, name, closed), is_live=True)
+
+
+def _open_raw(source: BinaryIO | Literal["-"], raw: RawFormat | None, closed: threading.Event) -> _Opened:
+    name = "standard input" if source == "-" else "the raw stream"
+    if raw is None:
+        raise InputError(f"{name} holds raw frames; their size and pixel format must be given")
+    if isinstance(source, io.TextIOBase):
+        raise InputError(f"{name} was opened as text; a binary file is expected")
+    return _Opened(name, raw_frames(sys.stdin.buffer if source == "-" else source, raw, name, closed))
+
+
+def _open_files(source: object, selection: slice) -> _Opened:
+    """A folder of images, a video file or an iterable of images."""
+    if isinstance(source, str | Path) and Path(source).is_dir() and list_images(Path(source)):
+        return _Opened(str(source), _readable(read_images(source, selection)), is_selected=True)
+    name = str(source) if isinstance(source, str | Path) else "the sequence of images"
+    files = cast("str | Path | Iterable[NDArray[np.uint8] | NDArray[np.uint16] | Frame]", source)
+    return _Opened(name, read_frames(files, selection), is_selected=True)
+
+
+def _is_raw(source: object) -> TypeGuard[BinaryIO | Literal["-"]]:
+    return source == "-" if isinstance(source, str) else hasattr(source, "read")
 
 
 def _readable(images: Iterator[Frame | Unusable]) -> Iterator[Frame]:
-    """The images of a folder without those that are damaged, which must not end the shot."""
+    """The images of a folder without the damaged ones, which must not end the shot."""
     for image in images:
         if isinstance(image, Frame):
             yield image
@@ -163,20 +158,31 @@ def _readable(images: Iterator[Frame | Unusable]) -> Iterator[Frame]:
             logger.warning("image %s is left out: %s", image.name, image.reason)
 
 
-class Source(Closing, Iterator[Frame]):
-    """Frames of a source, read by a thread of its own while they are consumed; made by `open_source`.
+def _selected(frames: Iterator[Frame], selection: slice) -> Iterator[Frame]:
+    """As `itertools.islice`, which would read one step beyond the end before it stops."""
+    for position in itertools.count():
+        frame = next(frames, None) if selection.stop is None or position < selection.stop else None
+        if frame is None:
+            return
+        if position >= selection.start and (position - selection.start) % selection.step == 0:
+            yield frame
 
-    Iterate over it, best in a ``with`` statement; leaving it, `close` or the end of the last reference stop the thread
-    and release the device. However the source ends after its first frame, the iteration just stops.
+
+class Source(Closing, Iterator[Frame]):
+    """Frames of a source, read in a thread of its own while they are consumed; `open_source` makes it.
+
+    Iterate over it, best in a ``with`` statement. The end of the statement, `close`, or the end of the last reference
+    stops the thread and releases the device. Once there was a first frame, any end of the source just ends the
+    iteration.
 
     Attributes:
-        name: of the source, for messages; no passwords of a URL.
-        ended: one sentence on why there are no further frames; empty while there may be.
-        broke_off: whether that was no regular end: it stalled, broke off inside a frame, or was damaged.
-        delivered: frames so far.
+        name: name of the source for messages; a URL is without its password.
+        ended: one sentence on why there are no further frames; empty while there may be some.
+        broke_off: whether the source ended irregularly: it stalled, ended inside a frame, or is damaged.
+        delivered: number of frames so far.
 
     Raises:
-        InputError: while iterating, if there is not even a first frame.
+        InputError: while iterating, if there is no first frame.
     """
 
     def __init__(
@@ -194,14 +200,14 @@ class Source(Closing, Iterator[Frame]):
         self.delivered = 0
         self._stall_seconds = stall_seconds
         self._queue = _Queue(queue_size, drop, closed)
-        # The thread must not know this object, which is to be collected when nobody consumes any more.
+        # The thread holds no reference to this object, so that it is collected when the consumer drops it.
         self._thread = threading.Thread(target=self._queue.fill, args=(frames,), name=f"read {name}", daemon=True)
         self._stop = weakref.finalize(self, self._queue.close)
         self._thread.start()
 
     @property
     def dropped(self) -> int:
-        """Frames dropped so far."""
+        """Number of frames dropped so far."""
         return self._queue.dropped
 
     def __next__(self) -> Frame:
@@ -220,10 +226,10 @@ class Source(Closing, Iterator[Frame]):
         raise StopIteration
 
     def close(self) -> None:
-        """Stop reading and release the device; frames that still wait are gone."""
+        """Stop reading and release the device; frames that still wait are dropped."""
         self.ended = self.ended or f"{self.name} was closed after {self._count()}"
         self._stop()
-        self._thread.join(_JOIN_SECONDS)  # unless it is stuck in foreign code, which nobody can interrupt
+        self._thread.join(_JOIN_SECONDS)  # it may hang in a read of OpenCV, which cannot be interrupted
 
     def _end(self, error: Exception | None) -> None:
         self.ended = f"{self.name} ended after {self._count()}"
@@ -243,7 +249,13 @@ class Source(Closing, Iterator[Frame]):
 
 
 class _Queue:
-    """Frames between the thread that reads and the one that consumes."""
+    """The frames that wait between the thread that reads and the one that consumes.
+
+    Attributes:
+        finished: whether the source has ended.
+        error: what ended it, None at a regular end.
+        dropped: number of frames dropped so far.
+    """
 
     def __init__(self, size: int, drop: bool, closed: threading.Event) -> None:
         self.finished = False
@@ -253,16 +265,16 @@ class _Queue:
         self._drop = drop
         self._closed = closed
         self._waiting: deque[Frame] = deque()
-        self._dropped_before = 0  # since a frame was taken, so all of them right before the next one
+        self._dropped_before = 0  # dropped since the last frame was taken, so right before the next one
         self._changed = threading.Condition()
 
     def fill(self, frames: Iterator[Frame]) -> None:
-        """Read until the end; the thread."""
+        """Read until the end of the source; runs in the reading thread."""
         try:
             for frame in frames:
                 if not self._put(frame):
                     break
-        except Exception as error:  # whatever ends a source must not end what was made of it
+        except Exception as error:  # the consumer decides what a failure means
             self.error = error
         finally:
             with self._changed:
@@ -281,7 +293,7 @@ class _Queue:
         return not self._closed.is_set()
 
     def take(self, timeout: float | None) -> Frame | None:
-        """The next frame; None after the end, and where none came within the timeout (seconds)."""
+        """The next frame; None at the end of the source, or if none comes within `timeout` seconds."""
         with self._changed:
             self._changed.wait_for(lambda: self._waiting or self.finished, timeout)
             if not self._waiting:
@@ -296,97 +308,3 @@ class _Queue:
         with self._changed:
             self._closed.set()
             self._changed.notify_all()
-
-
-def _chosen(frames: Iterator[Frame], selection: slice) -> Iterator[Frame]:
-    """As `itertools.islice`, which would read on to the next step before it stops."""
-    for position in itertools.count():
-        frame = next(frames, None) if selection.stop is None or position < selection.stop else None
-        if frame is None:
-            return
-        if position >= selection.start and (position - selection.start) % selection.step == 0:
-            yield frame
-
-
-def _camera_number(source: object) -> int | None:
-    if isinstance(source, int) and not isinstance(source, bool):
-        if source < 0:
-            raise InputError(f"{source} is no camera; they are counted from 0")
-        return source
-    match = re.fullmatch(r"camera:(.*)", source) if isinstance(source, str) else None
-    if match is not None and not re.fullmatch(r"\d+", match[1], re.ASCII):
-        raise InputError(f'"{source}" names no camera; camera:0 is the first one')
-    return None if match is None else int(match[1])
-
-
-def _is_raw(source: object) -> TypeGuard[BinaryIO | Literal["-"]]:
-    return source == "-" if isinstance(source, str) else hasattr(source, "read")
-
-
-def _without_secrets(url: str) -> str:
-    """Without user, password and query."""
-    parts = urlsplit(url)
-    return f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}"
-
-
-def _timeouts(stall_seconds: float | None) -> list[int]:
-    if stall_seconds is None:
-        return []
-    limit = max(1, round(1000 * stall_seconds))
-    return [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, limit, cv2.CAP_PROP_READ_TIMEOUT_MSEC, limit]
-
-
-def _open_device(name: str, *arguments: Any) -> cv2.VideoCapture:
-    with quiet_opencv():
-        capture = cv2.VideoCapture(*arguments)
-    if not capture.isOpened():
-        capture.release()
-        raise InputError(f"{name} cannot be opened")
-    return capture
-
-
-def _captured(capture: cv2.VideoCapture, name: str, closed: threading.Event) -> Iterator[Frame]:
-    """Frames of a camera or network stream, by the time of their arrival; these have no regular end."""
-    try:
-        begin: float | None = None
-        for index in itertools.count():
-            decoded, image = capture.read()
-            if closed.is_set():
-                return
-            if not decoded:
-                raise InputError(f"{name} gives no further frame")
-            now = time.monotonic()
-            begin = now if begin is None else begin
-            yield Frame(index, bgr_image(image, index), f"{index:06d}", now - begin)
-    finally:
-        capture.release()
-
-
-def _raw_frames(file: BinaryIO, raw: RawFormat, name: str, closed: threading.Event) -> Iterator[Frame]:
-    for index in itertools.count():
-        data = _read(file, raw.frame_bytes, closed)
-        if not data or closed.is_set():
-            return
-        if len(data) < raw.frame_bytes:
-            raise InputError(f"{name} ended inside frame {index}: {len(data)} of {raw.frame_bytes} bytes")
-        yield Frame(index, raw.image(data), f"{index:06d}")
-
-
-def _read(file: BinaryIO, size: int, closed: threading.Event) -> bytearray:
-    """As many bytes, fewer at the end of the file; looks up now and then whether anybody still wants them."""
-    read_some = getattr(file, "read1", file.read)  # what a pipe holds now, without waiting for the rest
-    data = bytearray()
-    while len(data) < size and not closed.is_set():
-        if _is_readable(file):
-            part = read_some(size - len(data))
-            if not part:
-                break
-            data += part
-    return data
-
-
-def _is_readable(file: BinaryIO) -> bool:
-    try:
-        return bool(select.select([file], [], [], _POLL_SECONDS)[0])
-    except (OSError, ValueError, TypeError):  # no descriptor, or none that can be waited for: reading may block
-        return True

@@ -1,4 +1,4 @@
-"""Ranges of frames, as users write them."""
+"""Ranges of frames: parsed, checked and written."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ _RANGE = re.compile(r"(\d*):(\d*)(?::(\d+))?", re.ASCII)
 
 
 def parse_range(text: str) -> slice:
-    """Parse ``START:STOP[:STEP]``, counted from 0 without STOP; START or STOP may be left out.
+    """Parse ``START:STOP[:STEP]``; frames count from 0, STOP is excluded, START or STOP may be left out.
 
     Raises:
-        InputError: another form, a negative number, a step of zero, or a range that holds no frame.
+        InputError: another form, a step of zero, or an empty range.
     """
     match = _RANGE.fullmatch(text.strip())
     if match is None or not any(match.groups()):
@@ -23,17 +23,17 @@ def parse_range(text: str) -> slice:
 
 
 def checked_range(frames: slice) -> slice:
-    """The same range with START and STEP filled in.
+    """The same range, with 0 and 1 for a missing START and STEP.
 
     Raises:
-        InputError: no slice, a negative number, a step of zero, or a range that holds no frame.
+        InputError: it is not a slice, holds a negative number or a step of zero, or is empty.
     """
     if not isinstance(frames, slice):
         raise InputError(f"frames is {frames!r}; a slice is expected, such as slice(0, 100, 2)")
     start, stop, step = frames.start or 0, frames.stop, 1 if frames.step is None else frames.step
     text = range_text(frames)
     if start < 0 or (stop is not None and stop < 0) or step < 0:
-        raise InputError(f"frame range {text} holds a negative number; frames are counted from 0")
+        raise InputError(f"frame range {text} holds a negative number; frames count from 0")
     if step == 0:
         raise InputError(f"frame range {text} has step 0; the step must be at least 1")
     if stop is not None and stop <= start:
@@ -42,6 +42,6 @@ def checked_range(frames: slice) -> slice:
 
 
 def range_text(frames: slice) -> str:
-    """As `parse_range` takes it."""
+    """The range in the form that `parse_range` reads."""
     start, stop = ("" if part is None else str(part) for part in (frames.start, frames.stop))
     return f"{start}:{stop}" + ("" if frames.step is None else f":{frames.step}")

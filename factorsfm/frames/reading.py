@@ -1,4 +1,4 @@
-"""Frames of a shot: from a video file, a folder of images (also while it is filled) or any iterable of images."""
+"""Frames of a shot, from a video file, a folder of images or an iterable of images."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from factorsfm.frames.ranges import checked_range
 from factorsfm.frames.video import decode, has_timestamps
 from factorsfm.support.errors import InputError
 
-# FFmpeg reports broken files on stderr, past all Python logging; a level that the user set is respected.
+# FFmpeg reports broken files on stderr, past all Python logging. A level that the user has set stays.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 
@@ -29,15 +29,14 @@ def read_frames(
     Grey, 16-bit and alpha images become 8-bit BGR; the EXIF orientation is applied.
 
     Args:
-        source: video file, folder of images (in natural order: img2 before img10; other files are ignored),
-            or iterable of images, (h, w), (h, w, 3) or (h, w, 4), uint8 or uint16, or of `Frame` objects,
+        source: a video file; a folder of images, in natural order (img2 before img10), whose other files are ignored;
+            an iterable of images, (h, w), (h, w, 3) or (h, w, 4), uint8 or uint16; or an iterable of `Frame` objects,
             which keep their index, name and timestamp.
-        frames: the part to read, e.g. ``slice(0, 100, 2)``; no negative numbers.
+        frames: the range to read, for example ``slice(0, 100, 2)``; no negative numbers.
 
     Raises:
-        InputError: at the call, if the source is missing, is no video or holds no images; while iterating,
-            if an image is unreadable or truncated, if a frame has another size than the first one, or if
-            there is no frame to read.
+        InputError: at the call, if the source does not exist, is not a video or holds no images; while iterating, if an
+            image is unreadable or truncated, if a frame has another size than the first one, or if there is no frame.
     """
     selection = checked_range(frames if frames is not None else slice(None))
     if isinstance(source, (str, Path)):
@@ -66,7 +65,14 @@ def read_frames(
 
 
 def uniform(frames: Iterator[Frame], source: str, start: int) -> Iterator[Frame]:
-    """Pass the frames on and insist that there is one at least and that all have one size."""
+    """The same frames, checked to be one or more, of the same size.
+
+    Args:
+        source, start: name of the source and first frame of the range, for the error messages.
+
+    Raises:
+        InputError: while iterating, if a frame has another size than the first one, or if there is none.
+    """
     first: Frame | None = None
     for frame in frames:
         first = first or frame

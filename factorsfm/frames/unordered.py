@@ -1,4 +1,4 @@
-"""Images of a set in any order: reading what can be read, and telling such sets from the frames of a shot."""
+"""Photographs in any order: reading them, and telling a folder of them from the frames of a shot."""
 
 from __future__ import annotations
 
@@ -19,17 +19,22 @@ from factorsfm.support.errors import InputError
 
 logger = logging.getLogger(__name__)
 
-_SAMPLED_PAIRS = 5
+_SAMPLED_PAIRS = 5  # consecutive pairs of images, evenly spread
 _SAMPLED_WIDTH = 480  # pixels
 _SAMPLED_CORNERS = 200
-_TRACKABLE_SHARE = 0.5  # of the corners, in the median pair, that a shot keeps from frame to frame
+_TRACKED_SHARE = 0.5  # of the corners, in the median pair, below which the images are no shot
 _CHECK_PX = 1.0  # largest forward-backward error of a tracked corner
-_PATCH, _SAME_CORNER = 15, 0.9  # pixels across, and correlation of a corner's surroundings in both images
+_PATCH_PX, _PATCH_CORRELATION = 15, 0.9  # side of the patch around a corner, and its least correlation in both images
 
 
 @dataclass(frozen=True, slots=True)
 class Unusable:
-    """An entry of the source that is no image: its position and name, and why."""
+    """An image that cannot be read.
+
+    Attributes:
+        index, name: as in `Frame`.
+        reason: why it cannot be read.
+    """
 
     index: int
     name: str
@@ -39,7 +44,7 @@ class Unusable:
 def read_images(
     source: str | Path | Iterable[Frame | NDArray[np.uint8]], frames: slice | None = None
 ) -> Iterator[Frame | Unusable]:
-    """The images of a set, of any sizes; what cannot be read is reported and does not stop the rest.
+    """The images of a set, of any sizes; an image that cannot be read becomes an `Unusable`.
 
     Args:
         source, frames: as in `read_frames`.
@@ -70,7 +75,7 @@ def read_images(
 
 
 def other_files(source: Path) -> list[str]:
-    """Names of the files in a folder that are no images."""
+    """Names of the files of a folder that are not images, without hidden files."""
     if not source.is_dir():
         return []
     images = set(list_images(source))
@@ -80,8 +85,8 @@ def other_files(source: Path) -> list[str]:
 def looks_unordered(source: Path, frames: slice | None = None) -> bool:
     """Whether a folder holds single photographs rather than the frames of a shot.
 
-    It does where the names without their numbers differ, or where most of a few consecutive pairs have different sizes
-    or share so little that corners cannot be tracked from one to the next.
+    It does if the names differ in more than their numbers, or if in most of a few consecutive pairs the images have
+    different sizes or so little overlap that corners cannot be tracked.
     """
     if not source.is_dir():
         return False
@@ -104,16 +109,19 @@ def _why_unordered(paths: list[Path]) -> str:
             first, second = read_image(paths[k]), read_image(paths[k + 1])
         except InputError:
             continue
-        shares.append(_trackable_share(first, second) if first.shape == second.shape else 0.0)
-    if shares and np.median(shares) < _TRACKABLE_SHARE:
+        shares.append(_tracked_share(first, second) if first.shape == second.shape else 0.0)
+    if shares and np.median(shares) < _TRACKED_SHARE:
         return f"{100 * np.median(shares):.0f} % of the corners can be tracked from one image to the next"
     return ""
 
 
-def _trackable_share(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> float:
-    """Share of the corners of the first image that are tracked to the second and back, and look the same there."""
-    if min(first.shape[:2]) < _PATCH or image_texture(cv2.cvtColor(first, cv2.COLOR_BGR2GRAY)) < BLANK_TEXTURE:
-        return 1.0  # a blank image says nothing, nor does one that holds no patch
+def _tracked_share(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> float:
+    """Share of the corners of the first image that pass the forward-backward check and look the same in the second.
+
+    It is 1 if the first image is blank, has no corners, or is smaller than a patch: then nothing can be said.
+    """
+    if min(first.shape[:2]) < _PATCH_PX or image_texture(cv2.cvtColor(first, cv2.COLOR_BGR2GRAY)) < BLANK_TEXTURE:
+        return 1.0
     size = (_SAMPLED_WIDTH, max(1, round(_SAMPLED_WIDTH * first.shape[0] / first.shape[1])))
     small = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (first, second))
     a, b = (cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) for image in small)
@@ -123,18 +131,19 @@ def _trackable_share(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> flo
     there, found, _ = cv2.calcOpticalFlowPyrLK(a, b, corners, None)
     back, found_back, _ = cv2.calcOpticalFlowPyrLK(b, a, there, None)
     error = np.linalg.norm((back - corners).reshape(-1, 2), axis=1)
-    alike = _correlation(_patches(a, corners), _patches(b, there)) > _SAME_CORNER
-    return float((found.ravel() & found_back.ravel() & (error < _CHECK_PX) & alike).mean())
+    same = _correlation(_patches(a, corners), _patches(b, there)) > _PATCH_CORRELATION
+    return float((found.ravel() & found_back.ravel() & (error < _CHECK_PX) & same).mean())
 
 
 def _patches(image: NDArray[np.uint8], at: NDArray[np.float32]) -> NDArray[np.float64]:
-    """(n, pixels) around each position."""
-    patches = [cv2.getRectSubPix(image, (_PATCH, _PATCH), tuple(map(float, xy))).ravel() for xy in at.reshape(-1, 2)]
+    """(n, pixels) of the patches around n positions, sub-pixel."""
+    size = (_PATCH_PX, _PATCH_PX)
+    patches = [cv2.getRectSubPix(image, size, tuple(map(float, xy))).ravel() for xy in at.reshape(-1, 2)]
     return np.array(patches, np.float64)
 
 
 def _correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n,) normalised cross-correlation of rows."""
+    """(n,) normalised cross-correlation of the rows of two (n, pixels) arrays."""
     a, b = (p - p.mean(axis=1, keepdims=True) for p in (a, b))
     power = np.sqrt((a * a).sum(axis=1) * (b * b).sum(axis=1))
     return np.asarray((a * b).sum(axis=1) / np.maximum(power, 1e-9))

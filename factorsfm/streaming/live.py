@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from factorsfm.camera.files import open_camera
 from factorsfm.frames.frame import Frame
-from factorsfm.frames.live_sources import RawFormat, Source, open_source
+from factorsfm.frames.live_sources import Source, open_source
+from factorsfm.frames.raw import RawFormat
 from factorsfm.priors.depth import DepthKind, DepthPrior, open_depth
 from factorsfm.priors.masks import MaskPrior, open_masks
 from factorsfm.result.reconstruction import Reconstruction

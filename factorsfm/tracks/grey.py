@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.frames.texture import _halved, _texture
+from factorsfm.frames.texture import half_size, texture_of_half
 from factorsfm.tracks.patches import Image
 
 _LEVELS = np.arange(256)
@@ -29,13 +29,13 @@ class GreyFrame(NamedTuple):
     @classmethod
     def of(cls, grey: Image) -> GreyFrame:
         """Of a whole image."""
-        half = _halved(grey)
+        half = half_size(grey)
         return cls(grey, half, cv2.calcHist([half], [0], None, [256], [0, 256]).ravel())
 
     @property
     def texture(self) -> float:
         """As in `TrackedFrame`."""
-        return _texture(self.half)
+        return texture_of_half(self.half)
 
 
 def exposed_as(previous: GreyFrame, frame: GreyFrame) -> GreyFrame:

@@ -88,7 +88,7 @@ def test_a_late_range_of_a_long_video_is_exact_though_most_of_it_is_not_decoded(
     cv2_capture = cv2.VideoCapture
     monkeypatch.setattr(cv2, "VideoCapture", Counting)
     if not sought:  # two frames at one time: their packets do not tell them apart
-        monkeypatch.setattr("factorsfm.frames.video._times", lambda *file: np.zeros(0))
+        monkeypatch.setattr("factorsfm.frames.video._frame_times", lambda *file: np.zeros(0))
     frames = list(read_frames(long_video, slice(200, 230, 10)))
     assert [frame.index for frame in frames] == numbers(frames) == [200, 210, 220]
     assert [frame.timestamp for frame in frames] == pytest.approx([8.0, 8.4, 8.8], abs=1e-6)

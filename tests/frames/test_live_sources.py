@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from factorsfm.frames.frame import Frame
-from factorsfm.frames.live_sources import RawFormat, open_source
+from factorsfm.frames.live_sources import open_source
+from factorsfm.frames.raw import RawFormat
 from factorsfm.support.errors import InputError
 
 WIDTH, HEIGHT = 64, 48
