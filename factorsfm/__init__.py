@@ -18,7 +18,8 @@ from factorsfm.frames.reading import read_frames
 from factorsfm.graph.explicit_graph import factor_graph
 from factorsfm.imagesets.add_images import add_images
 from factorsfm.polish.observability import CameraObservability
-from factorsfm.priors.depth import DepthFolder, DepthKind, DepthMap, DepthModel, DepthPrior
+from factorsfm.priors.depth import DepthFolder, DepthModel, DepthPrior
+from factorsfm.priors.depth_map import DepthKind, DepthMap
 from factorsfm.priors.masks import MaskFolder, MaskModel, MaskPrior
 from factorsfm.result.reading import read_result
 from factorsfm.result.reconstruction import FrameResult, PriorFit, Reconstruction

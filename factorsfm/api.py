@@ -21,7 +21,8 @@ from factorsfm.frames.reading import read_frames
 from factorsfm.frames.unordered import looks_unordered, other_files, read_images
 from factorsfm.imagesets.image_set import ImageSet
 from factorsfm.imagesets.photo_folder import work_folder
-from factorsfm.priors.depth import DepthFolder, DepthKind, DepthPrior, open_depth
+from factorsfm.priors.depth import DepthFolder, DepthPrior, open_depth
+from factorsfm.priors.depth_map import DepthKind
 from factorsfm.priors.masks import MaskFolder, MaskPrior, open_masks
 from factorsfm.result.reconstruction import Reconstruction
 from factorsfm.streaming.stream import Stream

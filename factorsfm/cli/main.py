@@ -23,7 +23,7 @@ from factorsfm.cli import stream as stream_command
 from factorsfm.cli.stream import unless_none
 from factorsfm.frames.ranges import parse_range
 from factorsfm.imagesets import add_images as extension
-from factorsfm.priors.depth import DepthKind
+from factorsfm.priors.depth_map import DepthKind
 from factorsfm.report.result_folder import check_directory, write_failure, write_folder
 from factorsfm.result.summary import conclusion
 from factorsfm.support.errors import FactorsfmError, ReconstructionError

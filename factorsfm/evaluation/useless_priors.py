@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.frames.frame import Frame
-from factorsfm.priors.depth import DepthKind, DepthMap
+from factorsfm.priors.depth_map import DepthKind, DepthMap
 
 _SIZE = (96, 160)  # resolution of the maps; they are smooth
 _CORRELATION = 0.25  # of the map's width

@@ -25,7 +25,8 @@ from factorsfm.lens.camera_model import distortion_of, with_distortion
 from factorsfm.lens.lens import LensEstimate
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.polish.polish import polish
-from factorsfm.priors.depth import DepthKind, DepthPrior
+from factorsfm.priors.depth import DepthPrior
+from factorsfm.priors.depth_map import DepthKind
 from factorsfm.priors.masks import MaskPrior
 from factorsfm.priors.read_priors import read_depth, read_mask
 from factorsfm.result.assembly import assemble

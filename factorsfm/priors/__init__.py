@@ -1,9 +1,10 @@
-"""What networks, or files in their place, say of a single image: depth, masks, and values at keypoints.
+"""What is known of a single image beforehand, from networks or files: its depth, and masks of what moves.
 
 Takes a frame, gives depth and masks. May import `frames` and what lies below it.
 """
 
-from factorsfm.priors.depth import DepthFolder, DepthKind, DepthMap, DepthModel, DepthPrior, open_depth
+from factorsfm.priors.depth import DepthFolder, DepthModel, DepthPrior, open_depth
+from factorsfm.priors.depth_map import DepthKind, DepthMap
 from factorsfm.priors.masks import MaskFolder, MaskModel, MaskPrior, open_masks
 from factorsfm.priors.networks import NETWORK_SPECS, NetworkSpec
 

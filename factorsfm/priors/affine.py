@@ -1,4 +1,4 @@
-"""Scale and shift of the depth prior of one image."""
+"""Scale and shift between the inverse depth of a scene and the depth prior of one image."""
 
 from __future__ import annotations
 
@@ -7,32 +7,46 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-_KERNEL = 2.0  # Cauchy scale in standard deviations
-SCALE_SIGMA = 0.5  # relative prior of the scale of an image's depth
-SHIFT_SIGMA = 0.3  # prior of its shift around 0, in units of the image's median inverse depth
-KNOWN_SHIFT_SIGMA = 0.02  # the same where the prior knows its zero (depth, metric depth)
+# Standard deviations of the affine of an image in a joint solve.
+SCALE_SIGMA = 0.5  # of the scale, relative
+SHIFT_SIGMA = 0.3  # of the shift around 0, in units of the median inverse depth of the image
+KNOWN_SHIFT_SIGMA = 0.02  # the same where the prior is depth, so that the shift is 0 but for errors
+
+_FIT_SHIFT_SIGMA = 0.5  # as `SHIFT_SIGMA`, in `fit_affine`
+_KERNEL = 2.0  # scale of the Cauchy kernel in standard deviations
+_ITERATIONS = 8
+_LEAST_SCALE = 0.05  # of the ratio of the medians
 
 
 def fit_affine(inverse_depth: Array, measured: Array, *, free_shift: bool = True) -> tuple[float, float, float]:
-    """Robust scale and shift with ``scale * inverse_depth + shift ~ measured``, and the spread of the residuals.
+    """Robust fit of ``scale * inverse_depth + shift ~ measured``.
 
-    The scale is kept positive: a mirrored prior is no prior.
+    Iteratively re-weighted least squares with a Cauchy kernel. The scale stays positive, because a prior that gets
+    smaller towards the camera is wrong.
+
+    Args:
+        inverse_depth: (n,) of the scene.
+        measured: (n,) inverse depth of the prior.
+        free_shift: whether the inverse depth of the prior is known up to a shift only.
+
+    Returns:
+        Scale, shift, and the robust standard deviation of the residuals in units of `measured`.
     """
     design = np.stack([inverse_depth, np.ones_like(inverse_depth)], -1)
     center = max(float(np.median(inverse_depth)), 1e-9)
-    # A weak prior (shift 0, scale from the medians) settles what the spread of the depths leaves open.
-    first = np.array([float(np.median(measured)) / center, 0.0])
-    shift_sigma = (0.5 if free_shift else 0.02) * max(float(np.median(measured)), 1e-9)
+    typical = float(np.median(measured))
+    # A weak prior (shift 0, scale from the medians) determines what a small spread of the depths leaves open.
+    first = np.array([typical / center, 0.0])
+    shift_sigma = (_FIT_SHIFT_SIGMA if free_shift else KNOWN_SHIFT_SIGMA) * max(typical, 1e-9)
     prior = np.diag([first[0] ** -2.0, shift_sigma**-2.0])
     solution = first
-    weight = np.ones_like(measured)
-    spread = 1.0
-    for _ in range(8):
+    sigma = 1.0
+    for _ in range(_ITERATIONS):
         residual = design @ solution - measured
-        spread = max(1.4826 * float(np.median(np.abs(residual))), 1e-6)
-        weight = 1.0 / (1.0 + (residual / (_KERNEL * spread)) ** 2)
-        normal = design.T @ (design * weight[:, None]) / spread**2
-        solution = np.linalg.solve(normal + prior, design.T @ (weight * measured) / spread**2 + prior @ first)
-    if solution[0] < 0.05 * first[0]:
-        solution = np.array([0.05 * first[0], float(np.median(measured)) - 0.05 * float(np.median(measured))])
-    return float(solution[0]), float(solution[1]), spread
+        sigma = max(1.4826 * float(np.median(np.abs(residual))), 1e-6)
+        weight = 1.0 / (1.0 + (residual / (_KERNEL * sigma)) ** 2)
+        normal = design.T @ (design * weight[:, None]) / sigma**2
+        solution = np.linalg.solve(normal + prior, design.T @ (weight * measured) / sigma**2 + prior @ first)
+    if solution[0] < _LEAST_SCALE * first[0]:
+        solution = np.array([_LEAST_SCALE * first[0], typical - _LEAST_SCALE * typical])
+    return float(solution[0]), float(solution[1]), sigma

@@ -1,4 +1,4 @@
-"""Mask priors: which pixels of an image to ignore, because what they show moves."""
+"""Mask priors: which pixels of a frame to ignore, because they show something that moves."""
 
 from __future__ import annotations
 
@@ -12,90 +12,88 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.frames.frame import Frame
-from factorsfm.priors.depth import FrameFiles, check_aspect, image_stem
+from factorsfm.priors.frame_folder import FrameFolder, check_aspect, image_stem
 from factorsfm.priors.models import find_model
 from factorsfm.priors.networks import Network, NetworkSpec
 from factorsfm.support.errors import InputError, ModelError
 
-# What moves in PASCAL VOC: aeroplane, bicycle, boat, bus, car, cat, dog, horse, motorbike, person, train.
+# Labels of PASCAL VOC that move: aeroplane, bicycle, boat, bus, car, cat, dog, horse, motorbike, person, train.
 MOVABLE_LABELS = frozenset({1, 2, 4, 6, 7, 8, 12, 13, 14, 15, 19})
 
-# Share of the image width by which masks are grown: a mask's outline is never exact, and a track's window
-# reaches across it.
+# How far masks grow, as a share of the image width: their outlines are not exact, and the window of a track reaches
+# across them.
 DEFAULT_MARGIN = 0.006
 
 
 @runtime_checkable
 class MaskPrior(Protocol):
-    """Anything that says which pixels of a frame to ignore."""
+    """A callable that gives the mask of a frame."""
 
     def __call__(self, frame: Frame) -> NDArray[np.bool_] | None:
-        """(h, w) of the frame's image, True = ignore; None where there is no mask."""
+        """(h, w) in the size of the frame, True = ignore; None if it has no mask."""
 
 
-class MaskFolder:
-    """A folder of masks, one file a frame; frames may lack one.
+class MaskFolder(FrameFolder):
+    """A folder of masks, one file per frame; frames may lack one.
 
-    Masks are .png, .bmp or .tif images of any size with the aspect ratio of their frame; non-zero = ignore.
-    Files named as COLMAP wants them (the full image name and ".png", as in "a.jpg.png") follow COLMAP: zero =
-    ignore. A mask belongs to the frame whose name it bears, else to the frame with its number, as in
-    `DepthFolder`.
+    Masks are .png, .bmp or .tif images of any size, with the aspect ratio of their frame; non-zero means ignore. Files
+    named as COLMAP names them (the full image name and ".png", as in "a.jpg.png") follow COLMAP: zero means ignore. A
+    mask belongs to the frame of its name or number, as in `DepthFolder`.
 
     Args:
         path: the folder.
-        margin: share of the image width by which the ignored area grows.
+        margin: how far the ignored area grows, as a share of the image width.
 
     Attributes:
-        asked, matched: how many frames were asked for, and how many of these had a mask.
+        asked, matched: number of frames whose mask was asked for, and of those among them that have one.
 
     Raises:
-        InputError: the folder is missing or holds no mask, or the margin is negative.
+        InputError: the folder does not exist or holds no mask, or the margin is negative.
     """
 
     def __init__(self, path: str | Path, margin: float = DEFAULT_MARGIN) -> None:
-        self._files = FrameFiles(Path(path), (".png", ".bmp", ".tif", ".tiff"), "masks")
+        super().__init__(Path(path), (".png", ".bmp", ".tif", ".tiff"), "masks")
         self._margin = _checked_margin(margin)
-        self.name = Path(path).name
-        self.asked = self.matched = 0
 
     def has(self, index: int) -> bool:
         """Whether the folder has a mask for this frame of a video."""
-        return self._files.find(Frame(index, np.empty((0, 0, 3), np.uint8), f"{index:06d}")) is not None
+        return self._find(Frame(index, np.empty((0, 0, 3), np.uint8), f"{index:06d}")) is not None
 
     def __call__(self, frame: Frame) -> NDArray[np.bool_] | None:
-        """The mask of a frame, None where the folder has none for it.
+        """The mask of a frame, None if the folder has none for it.
 
         Raises:
-            InputError: the mask cannot be read or has another aspect ratio than the frame.
+            InputError: the mask cannot be read, or has another aspect ratio than the frame.
         """
-        self.asked += 1
-        path = self._files.find(frame)
+        path = self.file_of(frame)
         if path is None:
             return None
         image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         if image is None:
             raise InputError(f"the mask {path} cannot be read")
         check_aspect(image, frame, path)
-        channels = image.reshape(*image.shape[:2], -1)[..., :3]  # a fourth one would be alpha
+        channels = image.reshape(*image.shape[:2], -1)[..., :3]  # without alpha
         marked = (channels != 0).any(axis=2)
-        colmap_style = image_stem(path.stem) != path.stem
-        self.matched += 1
-        return _fitted(~marked if colmap_style else marked, frame, self._margin)
+        is_colmap_style = image_stem(path.stem) != path.stem
+        return _fitted(~marked if is_colmap_style else marked, frame, self._margin)
 
 
 class MaskModel:
     """A semantic segmentation network in an ONNX file, such as DeepLab.
 
-    Its output is a label map, (1, h, w) of integers, or one score map per label, of which the largest wins.
+    Its output is a label map, (1, h, w) of integers, or one score map per label, of which the highest score counts.
 
     Args:
         path_or_name: the file, or a named network.
-        spec: how the network wants its image; guessed by default, see `Network`.
+        spec: how the network expects its image; guessed by default, see `Network`.
         labels: labels to ignore; by default persons, animals and vehicles of PASCAL VOC.
-        margin: share of the image width by which the ignored area grows.
+        margin: how far the ignored area grows, as a share of the image width.
+
+    Attributes:
+        name: name of the file.
 
     Raises:
-        ModelError: the network cannot be found, loaded or understood.
+        ModelError: the network cannot be found, fetched or loaded, or does not take one image.
         InputError: no labels, or a negative margin.
     """
 
@@ -117,7 +115,7 @@ class MaskModel:
         """The mask of a frame.
 
         Raises:
-            ModelError: the network fails on this frame or yields no label map.
+            ModelError: the network fails on this frame, or gives no label map.
         """
         labels = self._label_map(self._network(frame.image))
         return _fitted(np.isin(labels, self._labels), frame, self._margin)
@@ -137,10 +135,10 @@ class MaskModel:
 
 
 def open_masks(spec: str | Path | MaskPrior | None) -> MaskPrior | None:
-    """The mask prior that a user means.
+    """The mask prior that `spec` names.
 
     Args:
-        spec: a folder of masks, an ONNX file, "none" or None, or a mask prior, which is returned as it is.
+        spec: a folder of masks, an ONNX file, "none" or None; a mask prior is returned as it is.
 
     Raises:
         InputError: `spec` is none of these.
@@ -165,10 +163,10 @@ def _checked_margin(margin: float) -> float:
 
 
 def _fitted(ignore: NDArray[np.bool_], frame: Frame, margin: float) -> NDArray[np.bool_]:
-    """The mask at the frame's size, grown by the margin."""
+    """The mask in the size of the frame, grown by the margin (a share of the image width)."""
     height, width = frame.image.shape[:2]
     mask = ignore.astype(np.uint8)
-    # Grown before it is enlarged: there are fewer pixels then.
+    # Growing comes before resizing, because masks usually have fewer pixels than frames.
     radius = math.ceil(round(margin * width) * mask.shape[1] / width)
     if radius > 0:
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))

@@ -1,7 +1,7 @@
-"""Named networks: where each comes from, its checksum, and the folder it is kept in.
+"""Named networks: their source, their checksum and the folder that holds them.
 
-A named network is looked for in the folder ``FACTORSFM_MODELS`` (an environment variable), then in the user's
-cache, and only then fetched. Its checksum is verified every time.
+A named network is looked up in the folder that the environment variable ``FACTORSFM_MODELS`` names, then in the user's
+cache; if it is in neither, it is fetched. Its checksum is verified every time.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ _TIMEOUT_SECONDS = (3.0, 15.0)  # connect, read
 
 @dataclass(frozen=True, slots=True)
 class NamedModel:
-    """A network that can be asked for by name.
+    """A network that users can name.
 
     Attributes:
-        file: file name, the same in the models folder, the cache and at its origin.
-        url: where it is fetched from; pinned to one revision.
+        file: file name, the same in all folders and at its source.
+        url: where it is fetched from, pinned to one revision.
         sha256: hexadecimal digest of the file.
-        license: of the weights.
+        license: licence of the weights.
     """
 
     file: str
@@ -55,10 +55,10 @@ def cache_folder() -> Path:
 
 
 def model_folders() -> list[Path]:
-    """Where networks are looked for: the folder ``FACTORSFM_MODELS`` and the user's cache.
+    """The folders in which networks are looked up: that of ``FACTORSFM_MODELS``, if set, and the user's cache.
 
     Raises:
-        ModelError: the variable names no folder.
+        ModelError: the variable does not name a folder.
     """
     variable = os.environ.get(MODELS_VARIABLE)
     if not variable:
@@ -72,8 +72,8 @@ def find_model(path_or_name: str | Path) -> Path:
     """The file of a network given by its path or its name (a key of `MODELS`).
 
     Raises:
-        ModelError: no such file or name, a checksum that does not match, or a named network that is not on
-            this machine and cannot be fetched.
+        ModelError: there is no such file or name, the checksum does not match, or a named network is not on this
+            machine and cannot be fetched.
     """
     if str(path_or_name) in MODELS:
         return _find_named(str(path_or_name))
@@ -84,7 +84,7 @@ def find_model(path_or_name: str | Path) -> Path:
 
 
 def named_model(path: Path) -> str | None:
-    """The name of a named network by the checksum of its file, None for any other file."""
+    """The name of the network with this file's checksum, None if there is none."""
     digest = pooch.file_hash(str(path), alg="sha256") if path.is_file() else ""
     return next((name for name, model in MODELS.items() if model.sha256 == digest), None)
 
@@ -112,7 +112,7 @@ def _fetch(name: str) -> Path:
     model = MODELS[name]
     folder = cache_folder()
     logger.info("fetching the network %s from %s to %s", name, model.url, folder)
-    pooch.get_logger().setLevel(logging.WARNING)  # its progress lines go to stderr; ours is above
+    pooch.get_logger().setLevel(logging.WARNING)  # it would write progress to stderr
     try:
         pooch.retrieve(
             model.url,
@@ -121,10 +121,7 @@ def _fetch(name: str) -> Path:
             path=folder,
             downloader=pooch.HTTPDownloader(timeout=_TIMEOUT_SECONDS),
         )
-    except (
-        OSError,
-        ValueError,
-    ) as error:  # no connection, an HTTP error, a wrong checksum, a read-only cache
+    except (OSError, ValueError) as error:  # no connection, an HTTP error, a wrong checksum, a read-only cache
         raise ModelError(
             f"the network {name} is not on this machine and could not be fetched ({type(error).__name__}): "
             f"set {MODELS_VARIABLE} to a folder that holds {model.file}, or pass --depth FILE or --depth none"

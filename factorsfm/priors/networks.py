@@ -1,4 +1,4 @@
-"""Image networks in ONNX files: what they want to see, and running them."""
+"""Image networks in ONNX files: what input they expect, and running them."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ _INPUT_TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 
 @dataclass(frozen=True, slots=True)
 class NetworkSpec:
-    """How a network wants its image: ``(pixel * value_max / 255 - mean) / std``.
+    """The input that a network expects: ``(pixel * value_max / 255 - mean) / std``.
 
     Attributes:
         layout: order of the input's axes.
         color: order of the channels.
         value_max: value of a white pixel before `mean` and `std` are applied (1 or 255).
         mean, std: per channel in the order of `color`, on the scale of `value_max`.
-        size: (height, width) of the input, or None where the network takes any size.
-        free_height: input height where `size` is None; the width follows the image's aspect.
-        multiple_of: height and width are rounded to it where `size` is None.
-        interpolation: "area", "linear" or "cubic"; "area" means linear where the image is enlarged.
+        size: (height, width) of the input, None if the network takes any size.
+        free_height: height of the input if `size` is None; the width follows from the aspect ratio of the image.
+        multiple_of: height and width are rounded to a multiple of this if `size` is None.
+        interpolation: "area", "linear" or "cubic"; "area" becomes "linear" if the image is enlarged.
 
     Raises:
-        ModelError: a value outside these choices.
+        ModelError: a value is not among these choices.
     """
 
     layout: Layout = "NCHW"
@@ -83,7 +83,7 @@ NETWORK_SPECS: dict[str, NetworkSpec] = {
     "midas": replace(IMAGENET, free_height=256, interpolation="cubic"),
 }
 
-# Tried in order: DPT networks are often named "midas_..._dpt_...", and need DPT's normalisation.
+# Tried in this order, because DPT networks are often named "midas_..._dpt_..." and need the normalisation of DPT.
 _FAMILY_PATTERNS = {
     "tcmonodepth": r"tc-?monodepth|tcsmallnet",
     "depth_anything": r"depth-?anything",
@@ -95,9 +95,10 @@ _FAMILY_PATTERNS = {
 
 
 def network_family(path: Path) -> str | None:
-    """Key of `NETWORK_SPECS` that the file name contains ("Depth-Anything-v2": depth_anything), or None.
+    """Key of `NETWORK_SPECS` for a file, None if the network is unknown.
 
-    A named network is known by its checksum under any file name.
+    The file name contains the key in some spelling ("Depth-Anything-v2" gives depth_anything), or the checksum is that
+    of a named network.
     """
     name = re.sub(r"[-_. ]+", "-", path.stem.lower())
     by_name = (family for family, pattern in _FAMILY_PATTERNS.items() if re.search(pattern, name))
@@ -105,19 +106,20 @@ def network_family(path: Path) -> str | None:
 
 
 class Network:
-    """An ONNX network that takes one image, on the CPU.
+    """An ONNX network that takes one image, run on the CPU.
 
-    The input is described by `spec`. Without one it is guessed: a file name that contains a known name (a
-    key of `NETWORK_SPECS`) selects that description, any other network is given ImageNet normalisation;
-    layout and a fixed size are then read off the model's own input.
+    Args:
+        path: the file.
+        spec: the input that it expects. By default that of its family (`network_family`), or ImageNet normalisation for
+            an unknown network, with the layout and the fixed size of the network's own input.
 
     Attributes:
         path: the file.
-        spec: the description in use.
+        spec: the input that it expects.
 
     Raises:
-        ModelError: the file is missing, is no ONNX network, does not take one image (a single 4-D float input
-            with three channels, batch 1), or contradicts the given `spec`.
+        ModelError: the file is missing or not an ONNX network; it does not take one image (a single 4-D float input
+            with three channels, batch 1); or it contradicts `spec`.
     """
 
     def __init__(self, path: str | Path, spec: NetworkSpec | None = None) -> None:
@@ -128,7 +130,7 @@ class Network:
         self.spec = _guessed_spec(self.path, shape) if spec is None else _checked_spec(spec, self.path, shape)
 
     def __call__(self, image: NDArray[np.uint8]) -> NDArray[Any]:
-        """Run on a BGR (h, w, 3) image; return the first output as the network gives it.
+        """The network's first output for a BGR (h, w, 3) image, in the network's own shape and type.
 
         Raises:
             ModelError: the network fails on this input.
@@ -136,7 +138,7 @@ class Network:
         values = self.preprocess(image)
         try:
             output: NDArray[Any] = self._session.run(None, {self._input.name: values})[0]
-        except Exception as error:  # onnxruntime's exceptions have no root of their own
+        except Exception as error:  # the exceptions of onnxruntime have no common root
             height, width = self.input_size(image.shape[0], image.shape[1])
             raise ModelError(f"the network {self.path.name} fails on an input of {width}x{height}") from error
         return output
@@ -160,7 +162,7 @@ class Network:
             resized = cv2.cvtColor(resized, cv2.COLOR_BGR2RGB)
         gain = (self.spec.value_max / 255.0 / np.array(self.spec.std)).astype(np.float32)
         offset = (np.array(self.spec.mean) / np.array(self.spec.std)).astype(np.float32)
-        if self.spec.layout == "NCHW":  # the planes are parted as bytes, which takes a fifth of the time
+        if self.spec.layout == "NCHW":  # splitting planes of bytes takes a fifth of the time that floats take
             resized, gain, offset = np.stack(cv2.split(resized)), gain[:, None, None], offset[:, None, None]
         return np.ascontiguousarray((resized * gain - offset)[np.newaxis], dtype=self._dtype)
 
@@ -169,22 +171,22 @@ def open_session(path: Path) -> Any:
     """An onnxruntime session on the CPU.
 
     Raises:
-        ModelError: the file is missing or no ONNX network.
+        ModelError: the file is missing or not an ONNX network.
     """
     if not path.is_file():
         raise ModelError(f"there is no network file {path}")
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = min(2, cv2.getNumThreads())  # one where the process keeps to one
+    options.intra_op_num_threads = min(2, cv2.getNumThreads())  # one if the process is limited to one thread
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # the cores have other work between frames
-    options.log_severity_level = 4  # failures come back as exceptions; nothing goes to stderr
+    options.log_severity_level = 4  # fatal only: failures raise exceptions
     try:
         return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # onnxruntime's exceptions have no root of their own
+    except Exception as error:  # the exceptions of onnxruntime have no common root
         raise ModelError(f"{path} is not an ONNX network that onnxruntime can load") from error
 
 
 def _image_input(session: Any, path: Path) -> tuple[Any, list[int | None]]:
-    """The model's only input and its shape, None where an axis is free."""
+    """The network's only input and its shape, with None for a free axis."""
     inputs = session.get_inputs()
     shape = [length if isinstance(length, int) else None for length in inputs[0].shape] if inputs else []
     one_image = len(shape) == 4 and shape[0] in (1, None) and bool(_layouts(shape))
@@ -197,12 +199,13 @@ def _image_input(session: Any, path: Path) -> tuple[Any, list[int | None]]:
 
 
 def _layouts(shape: list[int | None]) -> list[Layout]:
-    """Layouts that the input's shape allows, a stated channel count before a free one."""
+    """Layouts that the shape of the input allows; those with a fixed channel count come first."""
     channels: dict[Layout, int | None] = {"NCHW": shape[1], "NHWC": shape[3]}
     return [layout for wanted in (3, None) for layout, count in channels.items() if count == wanted]
 
 
 def _image_axes(shape: list[int | None], layout: Layout) -> tuple[int | None, int | None]:
+    """Height and width of the input, None where free."""
     return (shape[2], shape[3]) if layout == "NCHW" else (shape[1], shape[2])
 
 
@@ -210,8 +213,7 @@ def _guessed_spec(path: Path, shape: list[int | None]) -> NetworkSpec:
     family = network_family(path)
     if family is None:
         logger.warning(
-            "%s is not a known network: it is given RGB with ImageNet normalisation; pass a NetworkSpec if "
-            "that is wrong",
+            "%s is not a known network: it gets RGB with ImageNet normalisation; pass a NetworkSpec if that is wrong",
             path.name,
         )
     spec = IMAGENET if family is None else NETWORK_SPECS[family]

@@ -1,4 +1,4 @@
-"""What the priors say of a frame, checked: a prior is foreign code."""
+"""The priors of a frame, checked: a prior may be the user's own code."""
 
 from __future__ import annotations
 
@@ -9,23 +9,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.frames.frame import Frame
-from factorsfm.priors.depth import DepthKind, DepthPrior
+from factorsfm.priors.depth import DepthPrior
+from factorsfm.priors.depth_map import DepthKind
 from factorsfm.priors.image_depth import ImageDepth
 from factorsfm.priors.masks import MaskPrior
 from factorsfm.support.errors import FactorsfmError, InputError, ModelError
 
-_LEAST_VALUES = 10
+_LEAST_VALUES = 10  # valid keypoints, below which a depth map is not used
 
 
 def read_mask(masks: MaskPrior | None, frame: Frame) -> NDArray[np.bool_] | None:
-    """What to ignore in a frame, True = ignore; None without a mask.
+    """The mask of a frame, (h, w), True = ignore; None if there is none.
 
     Raises:
         InputError: the prior fails, or its mask has another size than the frame.
     """
     if masks is None:
         return None
-    with _failure_named("mask", frame):
+    with _reported_failure("mask", frame):
         mask = masks(frame)
     if mask is not None and mask.shape != frame.image.shape[:2]:
         raise InputError(
@@ -35,12 +36,18 @@ def read_mask(masks: MaskPrior | None, frame: Frame) -> NDArray[np.bool_] | None
 
 
 def read_depth(depth: DepthPrior, frame: Frame, xy: NDArray[np.float64]) -> ImageDepth | None:
-    """The prior at keypoints (n, 2) of a frame, pixels; None where there is no map, or too little of it is valid.
+    """The depth prior at keypoints of a frame.
+
+    Args:
+        xy: (n, 2) pixels, centres at integers.
+
+    Returns:
+        The prior, or None if there is no map or fewer than 10 keypoints have a valid depth.
 
     Raises:
         InputError: the prior fails.
     """
-    with _failure_named("depth", frame):
+    with _reported_failure("depth", frame):
         depth_map = depth(frame)
     if depth_map is None:
         return None
@@ -53,8 +60,8 @@ def read_depth(depth: DepthPrior, frame: Frame, xy: NDArray[np.float64]) -> Imag
 
 
 @contextmanager
-def _failure_named(what: str, frame: Frame) -> Iterator[None]:
-    """Whatever a prior raises becomes an error that names the frame."""
+def _reported_failure(what: str, frame: Frame) -> Iterator[None]:
+    """Turn any exception of a prior into a `ModelError` that names the frame; errors of this package pass."""
     try:
         yield
     except FactorsfmError:

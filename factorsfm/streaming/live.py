@@ -14,7 +14,8 @@ from factorsfm.camera.files import open_camera
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.live_sources import Source, open_source
 from factorsfm.frames.raw import RawFormat
-from factorsfm.priors.depth import DepthKind, DepthPrior, open_depth
+from factorsfm.priors.depth import DepthPrior, open_depth
+from factorsfm.priors.depth_map import DepthKind
 from factorsfm.priors.masks import MaskPrior, open_masks
 from factorsfm.result.reconstruction import Reconstruction
 from factorsfm.streaming.frame_update import FrameUpdate

@@ -29,7 +29,8 @@ from factorsfm.lens.rolling_shutter import Recording
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.mapping.mapper import Mapper
 from factorsfm.polish.polish import polish
-from factorsfm.priors.depth import DepthKind, DepthPrior
+from factorsfm.priors.depth import DepthPrior
+from factorsfm.priors.depth_map import DepthKind
 from factorsfm.priors.image_depth import ImageDepth
 from factorsfm.priors.masks import MaskPrior
 from factorsfm.priors.read_priors import read_depth, read_mask

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.frames.frame import Frame
-from factorsfm.priors.depth import DepthKind, DepthMap, DepthPrior
+from factorsfm.priors.depth import DepthPrior
+from factorsfm.priors.depth_map import DepthKind, DepthMap
 from factorsfm.result.reconstruction import Reconstruction
 from factorsfm.streaming.frame_update import FrameUpdate
 from factorsfm.streaming.stream import Stream

@@ -28,7 +28,8 @@ from factorsfm.evaluation.useless_priors import (
     random_smooth_depth,
 )
 from factorsfm.frames.frame import Frame
-from factorsfm.priors.depth import DepthKind, DepthPrior
+from factorsfm.priors.depth import DepthPrior
+from factorsfm.priors.depth_map import DepthKind
 from factorsfm.support.errors import InputError
 
 SIZE = (320, 240)

@@ -217,7 +217,7 @@ def test_layout_and_size_are_read_off_the_input(
 def test_unknown_network_is_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING):
         Network(save_network(tmp_path / "thing.onnx", [1, 3, 8, 8]))
-    assert "thing.onnx is not a known network: it is given RGB with ImageNet normalisation" in caplog.text
+    assert "thing.onnx is not a known network: it gets RGB with ImageNet normalisation" in caplog.text
 
 
 @pytest.mark.parametrize(
