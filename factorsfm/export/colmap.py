@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import re
 import tempfile
 from collections.abc import Iterable
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from factorsfm.export.image_names import image_name
 from factorsfm.result.reconstruction import Reconstruction
 
 
@@ -30,7 +32,7 @@ def write_colmap(reconstruction: Reconstruction, folder: str | Path) -> None:
     One camera for each lens of the registered frames. The image id is the frame index + 1, the point id the row in
     ``reconstruction.points`` + 1. Points seen from fewer than two registered frames are left out. Pixel centres lie at
     0.5, as in all of COLMAP.
-    The text format cannot hold a blank in an image name; where there is one, the binary files are
+    The text format cannot hold white space in an image name; where there is some, the binary files are
     written as well (readers prefer them).
     """
     folder = Path(folder)
@@ -53,8 +55,8 @@ def write_colmap(reconstruction: Reconstruction, folder: str | Path) -> None:
         _point_lines(reconstruction, observations),
     )
 
-    names = {frame.index + 1: _image_name(frame.name) for frame in reconstruction.frames}
-    if any(" " in name for name in names.values()):
+    names = {frame.index + 1: image_name(frame.name) for frame in reconstruction.frames}
+    if any(name.split() != [name] for name in names.values()):
         model = pycolmap.Reconstruction(folder)
         for image_id, image in model.images.items():
             image.name = names[image_id]
@@ -110,7 +112,7 @@ def _image_lines(
             qx, qy, qz, qw = frame.cam_from_world.rotation.quat
             pose = map(_exact, (qw, qx, qy, qz, *frame.cam_from_world.translation))
             camera_id = 1 + cameras.index(reconstruction.camera_of(frame))
-            lines.append(_join((frame.index + 1, *pose, camera_id, _image_name(frame.name))))
+            lines.append(_join((frame.index + 1, *pose, camera_id, _on_one_line(image_name(frame.name)))))
             lines.append(_join(points2d[start:stop]))
     return lines
 
@@ -143,9 +145,8 @@ def _mean_errors(observations: _Observations, count: int) -> NDArray[np.float64]
     return np.where(number > 0, total / np.maximum(number, 1), -1.0)
 
 
-def _image_name(name: str) -> str:
-    """Frames of a video are named by a bare number; COLMAP expects the name of an image file."""
-    return name if PurePath(name).suffix else f"{name}.png"
+def _on_one_line(name: str) -> str:
+    return re.sub(r"[\t-\r]", "_", name)
 
 
 def _exact(value: float) -> str:

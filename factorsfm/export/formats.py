@@ -21,6 +21,7 @@ from factorsfm.export.usd import write_usd
 from factorsfm.export.writing import complete_file, complete_folder
 from factorsfm.result.reconstruction import Reconstruction
 from factorsfm.support.errors import InputError
+from factorsfm.support.file_names import check_name
 
 _AS_RECONSTRUCTED = Defaults()
 
@@ -94,13 +95,15 @@ def export(
         format: a name from `FORMATS`.
 
     Raises:
-        InputError: an unknown format, a package of an extra missing, no registered frame, or the path cannot be
-            written.
+        InputError: an unknown format, a package of an extra missing, no registered frame, an image name that leaves
+            its folder, or the path cannot be written.
     """
     if format not in FORMATS:
         raise InputError(f'"{format}" is no export format; the formats are {", ".join(FORMATS)}')
     if not reconstruction.registered:
         raise InputError("no frame is registered; there is nothing to export")
+    for frame in reconstruction.frames:
+        check_name(frame.name)
     chosen = FORMATS[format]
     sizes = {(c.width, c.height) for c in map(reconstruction.camera_of, reconstruction.registered)}
     if len(sizes) > 1 and format not in _ANY_SIZES:

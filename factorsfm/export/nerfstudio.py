@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import logging
-import math
 import shutil
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pycolmap
 
+from factorsfm.export.image_names import image_name
 from factorsfm.export.ply import write_ply
 from factorsfm.export.shot import Shot
 from factorsfm.frames.reading import read_frames
+from factorsfm.result.image_sources import image_sources
 from factorsfm.support.errors import InputError
 from factorsfm.support.json_text import json_text
 
@@ -45,7 +46,7 @@ def write_nerfstudio(shot: Shot, folder: Path) -> None:
         InputError: nerfstudio does not know the lens model, or the footage lacks frames.
     """
     r = shot.reconstruction
-    names = {frame.index: _image_name(frame.name) for frame in r.registered}
+    names = {frame.index: image_name(frame.name) for frame in r.registered}
     lenses = [_lens(r.camera_of(frame)) for frame in r.registered]
     models = {lens.pop("camera_model") for lens in lenses}
     if len(models) > 1:
@@ -66,16 +67,13 @@ def write_nerfstudio(shot: Shot, folder: Path) -> None:
     write_ply(shot.reconstruction, folder / "points.ply")
     if shot.footage is None:
         logger.warning("there is no footage: put the frames into images/ under the names of transforms.json")
-    else:
-        (folder / "images").mkdir()
-        added = [(part["source"], part["first"]) for part in shot.reconstruction.options.get("added", [])]
-        sources = [(shot.footage, 0), *added]
-        for (source, first), last in zip(sources, [*(first for _, first in added), math.inf], strict=True):
-            here = {index - first: name for index, name in names.items() if first <= index < last}
-            if source is None:
-                logger.warning("there are no files of %s: put these images into images/", ", ".join(here.values()))
-            elif here:
-                _write_images(Path(source), here, folder / "images")
+        return
+    for source in image_sources(shot.footage, r.options):
+        here = {index - source.first: name for index, name in names.items() if source.holds(index)}
+        if source.path is None and here:
+            logger.warning("there are no files of %s: put these images into images/", ", ".join(here.values()))
+        elif source.path is not None and here:
+            _write_images(source.path, here, folder / "images")
 
 
 def _lens(camera: pycolmap.Camera) -> dict[str, Any]:
@@ -97,7 +95,13 @@ def _lens(camera: pycolmap.Camera) -> dict[str, Any]:
 
 
 def _write_images(footage: Path, names: dict[int, str], folder: Path) -> None:
-    """Image files are copied as they are, frames of a video are written without loss."""
+    """Image files are copied as they are, frames of a video are written without loss.
+
+    Args:
+        names: of the files to write, by index in the footage.
+    """
+    for name in names.values():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
     missing = {index for index, name in names.items() if not (footage / name).is_file()}
     for index in names.keys() - missing:
         shutil.copyfile(footage / names[index], folder / names[index])
@@ -113,7 +117,3 @@ def _write_images(footage: Path, names: dict[int, str], folder: Path) -> None:
             raise OSError(f"the image {target.name} cannot be written")
     if missing:
         raise InputError(f"the footage {footage} lacks frame {min(missing)}, counted from 0")
-
-
-def _image_name(name: str) -> str:
-    return name if PurePath(name).suffix else f"{name}.png"

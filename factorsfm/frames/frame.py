@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.support.errors import InputError
+from factorsfm.support.file_names import check_name
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -18,10 +19,13 @@ class Frame:
     Attributes:
         index: position in the source, from 0, before any range or step is applied.
         image: (h, w, 3) uint8, BGR.
-        name: file name, or the zero-padded index for videos and iterables.
+        name: file name, perhaps with folders before it, or the zero-padded index for videos and iterables.
         timestamp: seconds from the start of the video, None if unknown.
         dropped: number of frames of a live source that were dropped right before this one.
         path: the image file, whose EXIF data may hold the focal length; None if the frame is not from an image file.
+
+    Raises:
+        InputError: the name is a path that leaves its folder.
     """
 
     index: int
@@ -30,6 +34,9 @@ class Frame:
     timestamp: float | None = None
     dropped: int = 0
     path: Path | None = None
+
+    def __post_init__(self) -> None:
+        check_name(self.name)
 
 
 def bgr_image(image: object, index: int) -> NDArray[np.uint8]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import json
-import math
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +13,54 @@ from numpy.typing import NDArray
 
 from factorsfm.camera.files import camera_from_json
 from factorsfm.camera.projection import PIXEL_CENTER
-from factorsfm.control.fit import ControlFit, ControlResidual
-from factorsfm.result.reconstruction import FrameResult, PriorFit, Reconstruction
+from factorsfm.control.fit import ControlFit
+from factorsfm.polish.observability import CameraObservability
+from factorsfm.result.reconstruction import FrameResult, LensFit, PriorFit, Reconstruction, RollingShutter
 from factorsfm.result.summary import part_name
 from factorsfm.support.errors import InputError
+from factorsfm.support.file_names import check_name
+from factorsfm.support.json_reading import read_json, typed
 from factorsfm.support.program import PROGRAM
 from factorsfm.support.status import FrameStatus, ShotKind
+
+_MOST_FRAMES = 2**31 - 1  # a COLMAP image has the index of its frame + 1 as identifier
+
+
+@dataclass(frozen=True, slots=True)
+class _Status:
+    """What summary.json says of a frame."""
+
+    index: int
+    name: str
+    timestamp: float | None
+    status: FrameStatus
+    message: str
+    registered: bool
+    keyframe: bool
+    observations: int
+    inliers: int
+    reprojection_error: float
+    prior: PriorFit | None
+    observability: CameraObservability | None
+    focal_std: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class _Summary:
+    """What summary.json says that the other files do not."""
+
+    camera: dict[str, Any]
+    lens: LensFit | None
+    shutter: RollingShutter | None
+    kind: ShotKind
+    parallax: float
+    metric: bool
+    control: ControlFit | None
+    notes: list[str]
+    seconds: dict[str, float]
+    options: dict[str, Any]
+    parts: int
+    statuses: list[_Status]
 
 
 def read_result(directory: str | Path) -> Reconstruction:
@@ -29,27 +71,25 @@ def read_result(directory: str | Path) -> Reconstruction:
     observations in frames that are not registered, and points that fewer than two registered frames see.
 
     Raises:
-        InputError: the folder holds no result, that of a shot that could not be reconstructed, or a damaged one.
+        InputError: the folder holds no result, an incomplete or a damaged one, or that of a shot that could not be
+            reconstructed.
     """
     directory = Path(directory)
-    content = _summary(directory)
+    content = _content(directory)
     try:
-        model = pycolmap.Reconstruction(directory / "colmap")
-        result = _reconstruction(content, model)
-    except (OSError, ValueError, KeyError, TypeError, IndexError, RuntimeError) as error:
+        summary = typed(_Summary, content, "summary.json")
+        result = _reconstruction(summary, pycolmap.Reconstruction(directory / "colmap"))
+    except (InputError, OSError, ValueError, KeyError, RuntimeError) as error:
         raise InputError(f"the result in {directory} is damaged: {error}") from error
-    result.others = [read_result(directory / part_name(number)) for number in range(2, content.get("parts", 1) + 1)]
+    result.others = [read_result(directory / part_name(number)) for number in range(2, summary.parts + 1)]
     return result
 
 
-def _summary(directory: Path) -> dict[str, Any]:
-    path = directory / "summary.json"
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise InputError(f"{directory} holds no result of factorsfm reconstruct: there is no summary.json") from error
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path} cannot be read: {error}") from error
+def _content(directory: Path) -> dict[str, Any]:
+    """The summary of a result, of which no more is known than that it is one."""
+    if not (directory / "summary.json").is_file():
+        raise InputError(f"{directory} holds no result of factorsfm reconstruct: there is no summary.json")
+    content = read_json(directory / "summary.json", "the summary")
     if not isinstance(content, dict) or content.get("program") != PROGRAM:
         raise InputError(f"{directory} holds no result of factorsfm reconstruct: its summary.json is not factorsfm's")
     if not content.get("reconstructed"):
@@ -57,84 +97,83 @@ def _summary(directory: Path) -> dict[str, Any]:
     return content
 
 
-def _reconstruction(content: dict[str, Any], model: pycolmap.Reconstruction) -> Reconstruction:
-    images = {image_id - 1: image for image_id, image in model.images.items()}
+def _reconstruction(summary: _Summary, model: pycolmap.Reconstruction) -> Reconstruction:
+    if not model.cameras:
+        raise InputError("its COLMAP model has no camera")
     own = len(model.cameras) > 1
-    frames = [_frame(status, images, own=own) for status in content["statuses"]]
-    point_ids = sorted(model.points3D)
-    row_of_point = {point_id: row for row, point_id in enumerate(point_ids)}
-    points = [model.points3D[point_id] for point_id in point_ids]
-    camera = camera_from_json(content["camera"]) if own else _copy(next(iter(model.cameras.values())))
-
-    frame_of, point_of, xy, error = [], [], [np.empty((0, 2))], [np.empty(0)]
-    for position, frame in enumerate(frames):
-        if frame.cam_from_world is None:
-            continue
-        seen = [point2d for point2d in images[frame.index].points2D if point2d.has_point3D()]
-        rows = [row_of_point[point2d.point3D_id] for point2d in seen]
-        if not rows:
-            continue
-        pixels = np.array([point2d.xy for point2d in seen])
-        frame_of += [position] * len(rows)
-        point_of += rows
-        xy.append(pixels - PIXEL_CENTER)
-        in_camera = frame.cam_from_world * np.array([points[row].xyz for row in rows])
-        error.append(np.linalg.norm((frame.camera or camera).img_from_cam(in_camera) - pixels, axis=1))
+    camera = camera_from_json(summary.camera) if own else _copy(next(iter(model.cameras.values())))
+    images = {image_id - 1: image for image_id, image in model.images.items()}
+    frames = [_frame(status, images, own=own) for status in summary.statuses]
+    row_of_point = {point_id: row for row, point_id in enumerate(sorted(model.points3D))}
+    points = [model.points3D[point_id] for point_id in row_of_point]
+    xyz = np.array([point.xyz for point in points], np.float64).reshape(-1, 3)
+    if not np.isfinite(xyz).all():
+        raise InputError("a point is not finite")
+    seen = [_seen(frame, images, row_of_point) for frame in frames]
+    pixels = np.concatenate([np.empty((0, 2)), *(xy for _, xy in seen)])
+    errors = [
+        np.linalg.norm((frame.camera or camera).img_from_cam(frame.cam_from_world * xyz[rows]) - xy, axis=1)
+        for frame, (rows, xy) in zip(frames, seen, strict=True)
+        if frame.cam_from_world is not None and len(rows)
+    ]
     return Reconstruction(
         camera=camera,
         frames=frames,
-        points=np.array([point.xyz for point in points], np.float64).reshape(-1, 3),
+        points=xyz,
         colors=np.array([point.color for point in points], np.uint8).reshape(-1, 3),
         track_ids=np.arange(len(points)),
-        observation_frame=np.array(frame_of, np.int64),
-        observation_point=np.array(point_of, np.int64),
-        observation_xy=_joined(xy),
-        observation_error=_joined(error),
-        prior_residual=np.full(len(frame_of), np.nan),
-        kind=ShotKind(content["kind"]),
-        parallax=_number(content["parallax"]),
-        metric=content["metric"],
-        control=_control(content["control"]),
-        notes=content["notes"],
-        seconds=content["seconds"],
-        options=content["options"],
+        observation_frame=np.repeat(np.arange(len(frames)), [len(rows) for rows, _ in seen]),
+        observation_point=np.concatenate([np.empty(0, np.int64), *(rows for rows, _ in seen)]),
+        observation_xy=pixels - PIXEL_CENTER,
+        observation_error=np.concatenate([np.empty(0), *errors]),
+        prior_residual=np.full(len(pixels), np.nan),
+        kind=summary.kind,
+        parallax=summary.parallax,
+        lens=summary.lens,
+        shutter=summary.shutter,
+        metric=summary.metric,
+        control=summary.control,
+        notes=summary.notes,
+        seconds=summary.seconds,
+        options=summary.options,
     )
 
 
-def _frame(status: dict[str, Any], images: dict[int, pycolmap.Image], *, own: bool) -> FrameResult:
+def _frame(status: _Status, images: Mapping[int, pycolmap.Image], *, own: bool) -> FrameResult:
     """`own`: whether the frames have lenses of their own."""
-    prior = status["prior"]
+    check_name(status.name)
+    if not 0 <= status.index < _MOST_FRAMES:
+        raise InputError(f"the index of a frame is {status.index}; 0 to {_MOST_FRAMES - 1} is expected")
+    image = images[status.index] if status.registered else None
+    pose = None if image is None else image.cam_from_world()
+    if pose is not None and not np.isfinite(pose.matrix()).all():
+        raise InputError(f"the pose of frame {status.index} is not finite")
     return FrameResult(
-        index=status["index"],
-        name=status["name"],
-        timestamp=status["timestamp"],
-        status=FrameStatus(status["status"]),
-        message=status["message"],
-        cam_from_world=images[status["index"]].cam_from_world() if status["registered"] else None,
-        keyframe=status["keyframe"],
-        observations=status["observations"],
-        inliers=status["inliers"],
-        reprojection_error=_number(status["reprojection_error"]),
-        prior=prior and PriorFit(**{name: _number(value) for name, value in prior.items()}),
-        camera=_copy(images[status["index"]].camera) if own and status["registered"] else None,
-        focal_std=status.get("focal_std"),
+        index=status.index,
+        name=status.name,
+        timestamp=status.timestamp,
+        status=status.status,
+        message=status.message,
+        cam_from_world=pose,
+        keyframe=status.keyframe,
+        observations=status.observations,
+        inliers=status.inliers,
+        reprojection_error=status.reprojection_error,
+        prior=status.prior,
+        observability=status.observability,
+        camera=_copy(image.camera) if image is not None and own else None,
+        focal_std=status.focal_std,
     )
 
 
-def _control(content: dict[str, Any] | None) -> ControlFit | None:
-    if content is None:
-        return None
-    residuals = [ControlResidual(**residual) for residual in content["residuals"]]
-    stds = _number(content["scale_std"]), _number(content["position_std"])
-    return ControlFit(residuals, content["held"], content["unused"], content["placed"], *stds)
-
-
-def _number(value: float | None) -> float:
-    return math.nan if value is None else float(value)
-
-
-def _joined(parts: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-    return np.concatenate(parts)
+def _seen(
+    frame: FrameResult, images: Mapping[int, pycolmap.Image], row_of_point: Mapping[int, int]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """(n,) rows of the points that a frame sees, and (n, 2) where, in COLMAP's pixels."""
+    keypoints = images[frame.index].points2D if frame.registered else []
+    seen = [keypoint for keypoint in keypoints if keypoint.has_point3D()]
+    rows = np.array([row_of_point[keypoint.point3D_id] for keypoint in seen], np.int64)
+    return rows, np.array([keypoint.xy for keypoint in seen], np.float64).reshape(-1, 2)
 
 
 def _copy(camera: pycolmap.Camera) -> pycolmap.Camera:

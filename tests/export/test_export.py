@@ -153,10 +153,11 @@ def test_colmap_leaves_out_points_seen_by_fewer_than_two_registered_frames(tmp_p
     assert all(point.error == -1 for point in model.points3D.values())
 
 
-def test_colmap_image_without_observations_and_names_with_blanks(tmp_path: Path) -> None:
+@pytest.mark.parametrize("space", [" ", "\t", "\n", "\r\n# "])
+def test_colmap_image_without_observations_and_names_with_white_space(tmp_path: Path, space: str) -> None:
     reconstruction = build()
     for k, frame in enumerate(reconstruction.frames):
-        frame.name = f"my shot {k}.jpg"
+        frame.name = f"my{space}shot {k}.jpg"
     keep = reconstruction.observation_frame != 1
     reconstruction.observation_frame = reconstruction.observation_frame[keep]
     reconstruction.observation_point = reconstruction.observation_point[keep]
@@ -165,7 +166,7 @@ def test_colmap_image_without_observations_and_names_with_blanks(tmp_path: Path)
     write_colmap(reconstruction, tmp_path)
     model = pycolmap.Reconstruction(tmp_path)
     assert {i: image.name for i, image in model.images.items()} == {
-        11 + 2 * k: f"my shot {k}.jpg" for k in (0, 1, 2, 4, 5)
+        11 + 2 * k: f"my{space}shot {k}.jpg" for k in (0, 1, 2, 4, 5)
     }
     assert len(model.image(13).points2D) == 0
     assert len(model.image(15).points2D) == 40

@@ -556,6 +556,33 @@ def test_every_format_is_all_or_nothing_and_replaces_itself(
     assert {p: p.read_bytes() for p in place.rglob("*") if p.is_file()} == before
 
 
+@pytest.mark.parametrize(
+    "name", ["../x.png", "a/../../x.png", "/x.png", "C:x.png", "c:\\x.png", "\\\\host\\x", "..\\x.png"]
+)
+def test_no_export_takes_a_name_that_leaves_the_folder(tmp_path: Path, name: str) -> None:
+    reconstruction = hard_reconstruction()
+    reconstruction.frames[1].name = name
+    options = ExportOptions(footage=noise_images(tmp_path / "shot", 21))
+    for format in FORMATS:
+        with pytest.raises(InputError, match=r"the image name '.*' leaves the folder of the images"):
+            export(reconstruction, tmp_path / "place" / "out", format=format, options=options)
+    assert [path.name for path in tmp_path.iterdir()] == ["shot"]
+
+
+def test_names_with_folders_are_exported_with_them(tmp_path: Path) -> None:
+    reconstruction = hard_reconstruction()
+    for frame in reconstruction.frames:
+        frame.name = f"take 1/b/{frame.index:06d}"
+    options = ExportOptions(footage=noise_images(tmp_path / "shot", 21))
+    for format in ("nerfstudio", "colmap", "colmap-binary"):
+        export(reconstruction, tmp_path / format, format=format, options=options)
+    expected = [f"take 1/b/{frame.index:06d}.png" for frame in reconstruction.registered]
+    images = tmp_path / "nerfstudio" / "images"
+    assert sorted(str(path.relative_to(images)) for path in images.rglob("*.png")) == expected
+    for format in ("colmap", "colmap-binary"):
+        assert sorted(i.name for i in pycolmap.Reconstruction(tmp_path / format).images.values()) == expected
+
+
 def test_output_that_holds_something_else_is_left_alone(tmp_path: Path) -> None:
     folder = tmp_path / "out"
     folder.mkdir()

@@ -1,0 +1,69 @@
+"""Where the images of a result are: in its own source, and in those of the images that were added later."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from factorsfm.support.json_reading import typed
+
+
+@dataclass(frozen=True, slots=True)
+class AddedImages:
+    """Images that were added to a result, as its options keep them under "added".
+
+    Attributes:
+        source: the folder or video file, None where the images were no files.
+        first: index in the result of the source's image 0.
+    """
+
+    source: str | None
+    first: int
+
+
+@dataclass(frozen=True, slots=True)
+class ImageSource:
+    """A folder or a video file, and which images of the result are in it.
+
+    Attributes:
+        path: None where the images were no files.
+        first: index in the result of the source's image 0.
+        stop: index in the result of image 0 of the next source.
+    """
+
+    path: Path | None
+    first: int
+    stop: float
+
+    def holds(self, index: int) -> bool:
+        """Whether an image with this index in the result is from here."""
+        return self.first <= index < self.stop
+
+
+def added_images(options: Mapping[str, Any]) -> list[AddedImages]:
+    """What was added to a result with these options, in order.
+
+    Raises:
+        InputError: the options are damaged.
+    """
+    return typed(list[AddedImages], options.get("added", []), "options.added")
+
+
+def image_sources(main: Path, options: Mapping[str, Any]) -> list[ImageSource]:
+    """All sources of a result.
+
+    Args:
+        main: where the images are that it was made from; options: of the result.
+
+    Raises:
+        InputError: the options are damaged.
+    """
+    added = added_images(options)
+    starts = [0, *(part.first for part in added)]
+    paths = [main, *(None if part.source is None else Path(part.source) for part in added)]
+    return [
+        ImageSource(path, first, stop) for path, first, stop in zip(paths, starts, [*starts[1:], math.inf], strict=True)
+    ]

@@ -1,0 +1,21 @@
+"""Names of images, which other programs and exports take as paths below a folder."""
+
+from __future__ import annotations
+
+import re
+from pathlib import PurePosixPath, PureWindowsPath
+
+from factorsfm.support.errors import InputError
+
+_DRIVE = re.compile(r"[A-Za-z]:")
+
+
+def check_name(name: str) -> None:
+    """Insist that an image of this name lies in its folder, on every system.
+
+    Raises:
+        InputError: it is an absolute path, has a drive letter, or goes up.
+    """
+    parts = {*PurePosixPath(name).parts, *PureWindowsPath(name).parts}
+    if ".." in parts or name.startswith(("/", "\\")) or _DRIVE.match(name) or "\0" in name:
+        raise InputError(f"the image name {name!r} leaves the folder of the images; a relative path is expected")
