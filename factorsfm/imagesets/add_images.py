@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import time
-import zlib
 from collections.abc import Callable, Iterable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import cv2
@@ -19,10 +18,12 @@ from factorsfm.frames.reading import read_frames
 from factorsfm.frames.unordered import read_images
 from factorsfm.imagesets.joint_adjustment import View, extended, local_pose
 from factorsfm.imagesets.mapper import SetMapper
-from factorsfm.imagesets.photo_folder import work_folder
+from factorsfm.imagesets.photo_folder import pixel_digest, work_folder
+from factorsfm.result.image_sources import AddedImages, ImageSource, added_images, image_sources
 from factorsfm.result.reading import read_result
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.support.errors import InputError, ReconstructionError
+from factorsfm.support.file_names import check_name
 from factorsfm.support.options import Options
 from factorsfm.support.similarity import Similarity
 from factorsfm.support.status import FrameStatus, ShotKind
@@ -92,7 +93,7 @@ class _Extension:
         self._known: list[View] = []
         self._absent: set[int] = set()  # rows of known images that cannot be matched: turned ones, and no files
         self._new: list[View] = []
-        self._added = list(base.options.get("added", []))
+        self._added = added_images(base.options)
         # The world in which everything is solved: the first camera, and a median distance of 1.
         first = base.registered[0].cam_from_world
         assert first is not None
@@ -110,30 +111,25 @@ class _Extension:
             rows = [rows[k] for k in np.linspace(0, len(rows) - 1, _MOST_OF_A_SHOT).astype(int)]
         wanted = {row: self._frames[row] for row in rows}
         report("images of the result", 0, len(rows))
-        sources = self._sources(source)
-        for (part, first), last in zip(sources, [*(f for _, f in sources[1:]), np.inf], strict=True):
-            self._read_known(part, first, {r: f for r, f in wanted.items() if first <= f.index < last})
+        main = source or self._base.options.get("source")
+        if main is None or not Path(str(main)).exists():
+            raise InputError(f"the images of the result are not at {main} any more; say where they are (source)")
+        for part in image_sources(Path(str(main)), self._base.options):
+            self._read_known(part, {row: frame for row, frame in wanted.items() if part.holds(frame.index)})
         if missing := set(rows) - {view.position for view in self._known} - self._absent:
             name = self._frames[min(missing)].name
             raise InputError(f"the image {name} of the result is not in its source; say where it is now (source)")
 
-    def _sources(self, source: str | Path | None) -> list[tuple[Path | None, int]]:
-        """Where images of the result are (None: they were no files), with the index of the first one."""
-        main = source or self._base.options.get("source")
-        if main is None or not Path(str(main)).exists():
-            raise InputError(f"the images of the result are not at {main} any more; say where they are (source)")
-        added = [(None if a["source"] is None else Path(a["source"]), int(a["first"])) for a in self._added]
-        return [(Path(str(main)), 0), *added]
-
-    def _read_known(self, source: Path | None, first: int, wanted: dict[int, FrameResult]) -> None:
-        if source is None:
+    def _read_known(self, source: ImageSource, wanted: dict[int, FrameResult]) -> None:
+        path = source.path
+        if path is None:
             self._absent.update(wanted)
-        if source is None or not wanted:
+        if path is None or not wanted:
             return
         by_name = {frame.name: row for row, frame in wanted.items()}
-        by_index = {frame.index - first: row for row, frame in wanted.items()}
-        folder = source.is_dir()
-        for image in read_images(source) if folder else read_frames(source, slice(0, max(by_index) + 1)):
+        by_index = {frame.index - source.first: row for row, frame in wanted.items()}
+        folder = path.is_dir()
+        for image in read_images(path) if folder else read_frames(path, slice(0, max(by_index) + 1)):
             row = by_name.get(image.name) if folder else by_index.get(image.index)
             if row is not None and isinstance(image, Frame):
                 if self._misfit(image):
@@ -159,6 +155,7 @@ class _Extension:
             if own and row is not None and self._frames[row].registered:
                 continue
             name = image.name if path is None or path.is_dir() or own else f"{path.stem}/{image.name}"
+            check_name(name)
             if name in names or (row is None and index in used):
                 raise InputError(f"the result has an image {name} with the index {index} already; give it another name")
             frame = FrameResult(index, name, getattr(image, "timestamp", None), FrameStatus.WAITING, "")
@@ -180,7 +177,7 @@ class _Extension:
             where = images if path is not None else "the sequence of images"
             raise InputError(f"there is no image to add in {where}{why}")
         if not own:
-            self._added.append({"source": None if path is None else str(path), "first": first})
+            self._added.append(AddedImages(None if path is None else str(path), first))
 
     def _misfit(self, image: Frame) -> str:
         """Why an image cannot be of the result's camera; empty where it can."""
@@ -190,7 +187,7 @@ class _Extension:
         return f"{width}x{height} pixels, another format than {camera.width}x{camera.height} of the camera"
 
     def _view(self, image: Frame, frame: FrameResult, position: int) -> View:
-        file = f"{position:06d}-{zlib.crc32(image.image.tobytes()):08x}.png"
+        file = f"{position:06d}-{pixel_digest(image.image)}.png"
         target = self._folder / "images" / file
         if not target.exists() and not cv2.imwrite(str(target), image.image, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
             raise InputError(f"cannot write to the work folder {self._folder}")
@@ -220,7 +217,7 @@ class _Extension:
             raise ReconstructionError(reason, self._frames)
         report("adjustment", 0, None)
         result = extended(self._base, self._frames, views, mapper, self._local, refine=self._refine)
-        result.options = {**self._base.options, "added": self._added}
+        result.options = {**self._base.options, "added": [asdict(part) for part in self._added]}
         result.notes.append(f"{len(registered)} of {len(self._new)} further images were registered on the result.")
         for view in self._new:
             if view not in registered:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import tempfile
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -79,8 +79,7 @@ class PhotoFolder:
         if max(width, height) > MAX_SIDE:
             photo.remark = f"reduced from {size_text(photo.full_size)} to {size_text(photo.size)} pixels"
             logger.warning("%s is %s", frame.name, photo.remark)
-        checksum = zlib.crc32(image.tobytes() + (b"" if mask is None else mask.tobytes()))
-        key = f"{checksum:08x}-{size_text(photo.size)}"
+        key = pixel_digest(image, mask)
         photo.file = f"{frame.index:06d}-{key}.png"
         first = self._known.setdefault(key, position)
         if first != position:
@@ -106,6 +105,14 @@ class PhotoFolder:
         photo.remark = "turned left by 90 degrees to the format of the others; its pose is that of the turned image"
         logger.warning("%s is %s", photo.name, photo.remark)
         photo.file, photo.size, photo.full_size = turned, photo.size[::-1], photo.full_size[::-1]
+
+
+def pixel_digest(image: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None) -> str:
+    """By which the same pixels, and the same mask, are known again: 128 bits, so that no two others ever share it."""
+    digest = hashlib.blake2b(f"{image.shape}".encode(), digest_size=16)
+    for pixels in (image, mask) if mask is not None else (image,):
+        digest.update(np.ascontiguousarray(pixels).data)
+    return digest.hexdigest()
 
 
 def size_text(size: tuple[int, int]) -> str:

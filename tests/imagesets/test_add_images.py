@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 
 from factorsfm import (
@@ -148,6 +149,30 @@ def test_a_result_grows_more_than_once_through_its_files(material: Set, tmp_path
     assert material.errors(result).max() < 0.005
     export(result, tmp_path / "splats", format="nerfstudio")
     assert len(list((tmp_path / "splats" / "images").iterdir())) == 8
+
+
+def test_frames_of_a_video_are_added_and_exported_in_a_folder_of_its_name(material: Set, tmp_path: Path) -> None:
+    height, width = material.shot.images[0].shape[:2]
+    video = cv2.VideoWriter(str(tmp_path / "clip.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 24, (width, height))
+    for k in NEW:
+        video.write(material.shot.images[k])
+    video.release()
+    arguments = [str(material.folder / "result"), str(tmp_path / "clip.avi"), "--output", str(tmp_path / "more")]
+    assert cli.main(["extend", *arguments]) == 0
+    result = read_result(tmp_path / "more")
+    assert [frame.name for frame in result.registered[6:]] == [f"clip/00000{k}" for k in range(3)]
+    for _ in range(2):  # the second one replaces the first one
+        export(result, tmp_path / "splats", format="nerfstudio")
+    frames = json.loads((tmp_path / "splats" / "transforms.json").read_text())["frames"]
+    assert [frame["file_path"] for frame in frames[6:]] == [f"images/clip/00000{k}.png" for k in range(3)]
+    reader = cv2.VideoCapture(str(tmp_path / "clip.avi"))
+    for frame in frames[6:]:
+        np.testing.assert_array_equal(cv2.imread(str(tmp_path / "splats" / frame["file_path"])), reader.read()[1])
+    export(result, tmp_path / "model", format="colmap")
+    names = {image.name for image in pycolmap.Reconstruction(tmp_path / "model").images.values()}
+    assert names == {*(f"o_{k}.png" for k in OLD), *(f"clip/00000{k}.png" for k in range(3))}
+    again = add_images(result, [material.shot.images[4]])  # matched with the frames of the video, too
+    assert again.frames[-1].registered
 
 
 @pytest.mark.slow
