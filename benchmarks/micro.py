@@ -170,7 +170,8 @@ def _keyframes(landmarks: int, count: int) -> tuple[float, list[MappedImage], Ar
         tracks = ImageTracks(
             k,
             np.arange(len(everywhere)),
-            normalized_from_pixels(scene.camera, xy[np.searchsorted(ids, everywhere)]),
+            xy[np.searchsorted(ids, everywhere)],
+            scene.camera,
             ImageDepth(inverse, np.ones(len(everywhere)), 1.0),
         )
         rotation, translation = pose.rotation.matrix(), unit * pose.translation

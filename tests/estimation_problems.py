@@ -7,7 +7,7 @@ import pycolmap
 
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.state import State
-from factorsfm.camera.projection import normalized_from_pixels
+from factorsfm.camera.projection import normalized_from_pixels, pixels_from_normalized
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.priors.image_depth import ImageDepth
 from factorsfm.support.status import FrameStatus
@@ -64,6 +64,12 @@ def make_problem(motion, *, frames=10, points=100, parallax=0.05, noise_px=0.0, 
     return Problem(truth, points, observations, focal, noise_px)
 
 
+def tracks_at(position, ids, xy, depth=None, *, focal=1.0):
+    """Tracks of an image at normalised coordinates (n, 2), seen by a pinhole."""
+    camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=640, height=360, params=[focal, 320.0, 180.0])
+    return ImageTracks(position, ids, pixels_from_normalized(camera, xy), camera, depth)
+
+
 def image_depth(problem, frame, ids, *, scale=1.0, shift=0.0, noise=0.0, seed=0):
     """A prior at some points of a frame: ``scale / z + shift`` and noise, everywhere reliable."""
     value = scale / problem.depth(frame, ids) + shift
@@ -77,7 +83,7 @@ def mapped_images(problem, state, *, guided=(), **prior):
     for k in range(problem.frames):
         ids, xy = problem.of_frame(k)
         depth = image_depth(problem, k, ids, **prior) if k in guided else None
-        tracks = ImageTracks(k, ids, xy, depth)
+        tracks = tracks_at(k, ids, xy, depth, focal=problem.focal)
         images.append(MappedImage(tracks, FrameStatus.REGISTERED, "", state.rotation[k], state.translation[k]))
     return images
 

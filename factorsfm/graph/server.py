@@ -13,6 +13,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import pycolmap  # noqa: F401  with the images; its import sets a handler of SIGTERM, which `serve` then replaces
+
 from factorsfm.graph.keyframe_graph import FactorGraph
 from factorsfm.support.threads import OneThreadEach
 

@@ -12,7 +12,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.camera.projection import PIXEL_CENTER, normalized_from_pixels
+from factorsfm.camera.projection import PIXEL_CENTER
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.reading import read_frames
 from factorsfm.frames.unordered import read_images
@@ -225,7 +225,7 @@ class _Extension:
         return result
 
     def _match(self, views: list[View]) -> list[ImageTracks]:
-        """Tracks of all images, normalised; their pixels and colours are left in the views."""
+        """Tracks of all images; their pixels and colours are left in the views."""
         camera = self._base.camera
         cameras = []
         for view in views:
@@ -238,12 +238,11 @@ class _Extension:
         tracks = []
         for k, (view, keypoints, (ids, rows)) in enumerate(zip(views, matches.keypoints, joined, strict=True)):
             scale = np.array([camera.width, camera.height]) / view.size
-            xy = (keypoints[rows] + PIXEL_CENTER) * scale - PIXEL_CENTER
-            uv = normalized_from_pixels(camera, xy)
-            good = np.isfinite(uv).all(axis=1)
-            view.ids, view.xy = ids[good], xy[good]
+            seen = ImageTracks(k, ids, (keypoints[rows] + PIXEL_CENTER) * scale - PIXEL_CENTER, camera)
+            good = seen.invertible
+            tracks.append(seen.of(good))
+            view.ids, view.xy = tracks[-1].ids, tracks[-1].pixels
             image = np.asarray(cv2.imread(str(self._folder / "images" / view.file)), np.uint8)
             x, y = np.clip(np.rint(keypoints[rows][good]).astype(int), 0, np.array(view.size) - 1).T
             view.rgb = image[y, x][:, ::-1]
-            tracks.append(ImageTracks(k, view.ids, uv[good]))
         return tracks

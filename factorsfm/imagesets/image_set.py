@@ -141,8 +141,8 @@ class ImageSet:
         if len(used) < 2:
             raise self._failure(f"{len(used)} of {len(self.photos)} images can be used, at least 2 needed", [])
         report("matching", 0, None)
-        tracks, pixels = self._match(used)
-        colors = self._look_up(used, tracks, pixels, report)
+        tracks = self._match(used)
+        colors = self._look_up(used, tracks, report)
         report("mapping", 0, None)
         focal = 0.5 * (camera.focal_length_x + camera.focal_length_y)
         with self._timed("mapping"), OneThreadEach():
@@ -156,8 +156,8 @@ class ImageSet:
                 f"{self.photos[worst].name}: {images[worst].message}",
                 images,
             )
-        result = self._solve(parts[0], camera, pixels, colors, report, control)
-        result.others = [self._solve(part, camera, pixels, colors, report, None) for part in parts[1:]]
+        result = self._solve(parts[0], camera, colors, report, control)
+        result.others = [self._solve(part, camera, colors, report, None) for part in parts[1:]]
         for number, part in enumerate((result, *result.others), 1):
             part.notes += self._summary(part, number, parts)
             part.seconds = dict(self.seconds)
@@ -194,8 +194,8 @@ class ImageSet:
 
     # --- steps --------------------------------------------------------------------------------------------------
 
-    def _match(self, used: list[int]) -> tuple[list[ImageTracks], list[Array]]:
-        """Tracks of all images, normalised, and their pixels at the full size of their cameras."""
+    def _match(self, used: list[int]) -> list[ImageTracks]:
+        """Tracks of all images, in pixels of their cameras at full size."""
         cameras = [_resized(self._cameras[self.photos[k].camera], self.photos[k].size) for k in used]
         names = [self.photos[k].file for k in used]
         with self._timed("matching"):
@@ -204,22 +204,17 @@ class ImageSet:
             )
             joined = join_tracks(matches.keypoints, matches.pairs)
         none = np.zeros(0, np.int64), np.zeros((0, 2))
-        tracks = [ImageTracks(k, *none) for k in range(len(self.photos))]
-        pixels = [np.zeros((0, 2))] * len(self.photos)
-        for k, own, keypoints, (ids, rows) in zip(used, cameras, matches.keypoints, joined, strict=True):
+        tracks = [ImageTracks(k, *none, self._cameras[photo.camera]) for k, photo in enumerate(self.photos)]
+        for k, keypoints, (ids, rows) in zip(used, matches.keypoints, joined, strict=True):
             if len(keypoints) < _LEAST_KEYPOINTS:
                 self.photos[k].remark = f"{len(keypoints)} of {_LEAST_KEYPOINTS} needed keypoints: hardly any texture"
-            xy = np.asarray(own.cam_from_img(keypoints[rows] + PIXEL_CENTER), np.float64).reshape(-1, 2)
-            good = np.isfinite(xy).all(axis=1)
-            full = self._cameras[self.photos[k].camera]
-            scale = np.array([full.width, full.height]) / self.photos[k].size
-            tracks[k] = ImageTracks(k, ids[good], xy[good])
-            pixels[k] = (keypoints[rows][good] + PIXEL_CENTER) * scale - PIXEL_CENTER
-        return tracks, pixels
+            camera = self._cameras[self.photos[k].camera]
+            scale = np.array([camera.width, camera.height]) / self.photos[k].size
+            seen = ImageTracks(k, ids, (keypoints[rows] + PIXEL_CENTER) * scale - PIXEL_CENTER, camera)
+            tracks[k] = seen.of(seen.invertible)
+        return tracks
 
-    def _look_up(
-        self, used: list[int], tracks: list[ImageTracks], pixels: list[Array], progress: Progress
-    ) -> NDArray[np.uint8]:
+    def _look_up(self, used: list[int], tracks: list[ImageTracks], progress: Progress) -> NDArray[np.uint8]:
         """Depth of the tracks, in place, and their colours (RGB by track id)."""
         count = max((int(t.ids[-1]) + 1 for t in tracks if len(t.ids)), default=0)
         colors = np.zeros((count, 3), np.uint8)
@@ -229,7 +224,7 @@ class ImageSet:
             image = self._files.read(photo)
             full = self._cameras[photo.camera]
             scale = np.array(photo.size) / [full.width, full.height]
-            xy = (pixels[k] + PIXEL_CENTER) * scale - PIXEL_CENTER
+            xy = (tracks[k].pixels + PIXEL_CENTER) * scale - PIXEL_CENTER
             x, y = np.clip(np.rint(xy).astype(int), 0, np.array(photo.size) - 1).T
             colors[tracks[k].ids] = image[y, x][:, ::-1]
             if self._depth is not None and len(xy):
@@ -242,7 +237,6 @@ class ImageSet:
         self,
         part: SetMapper,
         camera: pycolmap.Camera,
-        pixels: list[Array],
         colors: NDArray[np.uint8],
         progress: Progress,
         control: LocatedControl | None,
@@ -269,7 +263,6 @@ class ImageSet:
             polished,
             part.images,
             self.photos,
-            pixels,
             colors,
             camera,
             lens_given=self._lens_given,

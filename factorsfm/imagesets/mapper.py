@@ -17,7 +17,7 @@ from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.gather import gather
 from factorsfm.imagesets.covisibility import common_tracks, components, longest_tracks, pyramid_score, track_lengths
 from factorsfm.imagesets.start import SIGMA_PX, median_angle, possible_starts
-from factorsfm.mapping.mapped_images import MappedImage, renormalize, state_of
+from factorsfm.mapping.mapped_images import MappedImage, refocus, state_of
 from factorsfm.mapping.point_map import PointMap
 from factorsfm.mapping.registration import register_image
 from factorsfm.mapping.starts import NoStart, Start
@@ -52,7 +52,7 @@ def map_parts(tracks: list[ImageTracks], focal: float, options: Options) -> list
         its message says why it is not in the first map that was made. That one is there even without images.
     """
     parts: list[SetMapper] = []
-    nothing = np.zeros(0, np.int64), np.zeros((0, 2))
+    nothing = np.zeros(0, np.int64)
     while True:
         mapper = SetMapper(tracks, focal, options)
         mapper.run()
@@ -63,7 +63,7 @@ def map_parts(tracks: list[ImageTracks], focal: float, options: Options) -> list
         done = {image.tracks.position for image in (found if len(found) >= _SMALLEST_PART else tried)}
         if not done:
             break
-        tracks = [ImageTracks(t.position, *nothing) if t.position in done else t for t in tracks]
+        tracks = [t.of(nothing) if t.position in done else t for t in tracks]
     for part in parts[1:]:  # there, images were missing
         for image, first in zip(part.images, parts[0].images, strict=True):
             if not image.registered:
@@ -347,5 +347,5 @@ class SetMapper:
         return wrong if wrong.sum() <= _MOST_CONTRADICTED * count else np.zeros(count, bool)
 
     def _set_focal(self, focal: float) -> None:
-        renormalize(self.images, self.focal / focal)
+        refocus(self.images, focal / self.focal)
         self.focal = focal

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.adjustment.state import State
+from factorsfm.camera.projection import with_focal
 from factorsfm.support.status import FrameStatus
 from factorsfm.tracks.image_tracks import ImageTracks
 
@@ -66,7 +67,9 @@ def state_of(images: Sequence[MappedImage], points: Array, focal: float) -> Stat
     )
 
 
-def renormalize(images: Sequence[MappedImage], ratio: float) -> None:
-    """What was seen with another focal length; `ratio`: the former one over the new one."""
+def refocus(images: Sequence[MappedImage], ratio: float) -> None:
+    """Give the images, which may share cameras, `ratio` times their present focal lengths."""
+    cameras = {id(image.tracks.camera): image.tracks.camera for image in images}
+    refocused = {key: with_focal(camera, ratio * camera.mean_focal_length()) for key, camera in cameras.items()}
     for image in images:
-        image.tracks = replace(image.tracks, xy=image.tracks.xy * ratio)
+        image.tracks = replace(image.tracks, camera=refocused[id(image.tracks.camera)])

@@ -18,7 +18,7 @@ from factorsfm.mapping.keyframes import carry, is_keyframe
 from factorsfm.mapping.live_covariance import live_covariance
 from factorsfm.mapping.map_registration import NotOnMap, register_by_corners, register_on_map
 from factorsfm.mapping.map_update import YOUNG_KEYFRAMES, MapCopy, MapUpdate, add_tracks
-from factorsfm.mapping.mapped_images import MappedImage, renormalize
+from factorsfm.mapping.mapped_images import MappedImage, refocus
 from factorsfm.mapping.point_map import PointMap
 from factorsfm.mapping.registration import Registration
 from factorsfm.mapping.starter import Starter
@@ -414,5 +414,5 @@ class Mapper:
 
     def _set_focal(self, focal: float) -> None:
         """Normalise all that was seen with another focal length."""
-        renormalize(self.images, self.focal / focal)
+        refocus(self.images, focal / self.focal)
         self.focal = focal

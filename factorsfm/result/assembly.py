@@ -42,7 +42,6 @@ def assemble(
     polished: Polished,
     images: list[MappedImage],
     frames: Sequence[SeenFrame],
-    pixels: list[Array],
     colors: NDArray[np.uint8],
     camera: pycolmap.Camera,
     *,
@@ -55,7 +54,6 @@ def assemble(
     """The public result.
 
     Args:
-        pixels: keypoints (pixels, centres at integers) of each frame, in the order of its track ids.
         colors: RGB by track id.
         lens_given: whether the camera is known, and no guess.
         prior_given: whether there is a depth prior at all; metric: whether its unit is the metre.
@@ -89,8 +87,8 @@ def assemble(
     xy = np.empty((len(frame), 2))
     for k in np.unique(frame):
         mine = frame == k
-        ids = images[positions[k]].tracks.ids
-        xy[mine] = pixels[positions[k]][np.searchsorted(ids, polished.tracks[point[mine]])]
+        tracks = images[positions[k]].tracks
+        xy[mine] = tracks.pixels[np.searchsorted(tracks.ids, polished.tracks[point[mine]])]
     points = state.bearing[kept] / state.inverse_distance[kept, None] * unit
     general = polished.motion.kind is ShotKind.GENERAL
     frame_results = _frame_results(polished, images, frames, camera, unit)

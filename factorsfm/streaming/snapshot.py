@@ -14,8 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 
+from factorsfm.camera.files import camera_from_json, camera_to_json
 from factorsfm.mapping.map_update import MapUpdate
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.priors.image_depth import ImageDepth
@@ -31,14 +33,14 @@ _TYPES: dict[str, Any] = {t.__name__: t for t in (FrameStatus, ImageDepth, Image
 
 
 def write_snapshot(path: Path, state: Mapping[str, Any]) -> None:
-    """Write a state: nested dicts, lists, tuples, numbers, strings, arrays, and the estimator's own records.
+    """Write a state: nested dicts, lists, tuples, numbers, strings, arrays, cameras, and the estimator's own records.
 
     Raises:
         InputError: the file cannot be written; an older one at its place is untouched.
     """
-    chunks: list[bytes] = []
-    header = json.dumps(_packed(state, chunks)).encode()
-    body = b"".join([_MAGIC, len(header).to_bytes(8, "little"), header, *chunks])
+    writer = _Writer()
+    header = json.dumps(writer.packed(state)).encode()
+    body = b"".join([_MAGIC, len(header).to_bytes(8, "little"), header, *writer.chunks])
     temporary = None
     try:
         with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
@@ -73,32 +75,46 @@ def read_snapshot(path: Path) -> dict[str, Any]:
     end = begin + int.from_bytes(body[len(_MAGIC) : begin], "little")
     try:
         state = _Reader(body[end:]).value(json.loads(body[begin:end]))
-    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, OverflowError, RecursionError, InputError) as error:
         raise InputError(f"snapshot {path} does not hold the state of a stream: {error!r}") from error
     if not isinstance(state, dict):
         raise InputError(f"snapshot {path} does not hold the state of a stream")
     return state
 
 
-def _packed(value: Any, chunks: list[bytes]) -> Any:
-    """JSON, with the bytes of arrays in `chunks`."""
-    if isinstance(value, Enum):
-        return {"type": type(value).__name__, "value": value.value}
-    if value is None or isinstance(value, bool | int | float | str):
-        return value
-    if isinstance(value, np.generic):
-        return value.item()
-    if isinstance(value, np.ndarray):
-        chunks.append(np.ascontiguousarray(value).tobytes())
-        return {"array": value.dtype.name, "shape": value.shape}
-    if isinstance(value, list | tuple):
-        return {type(value).__name__: [_packed(item, chunks) for item in value]}
-    if isinstance(value, Mapping):
-        return {"dict": [[_packed(k, chunks), _packed(v, chunks)] for k, v in value.items()]}
-    if is_dataclass(value) and type(value).__name__ in _TYPES:
-        record = {f.name: _packed(getattr(value, f.name), chunks) for f in fields(value)}
-        return {"type": type(value).__name__, "fields": record}
-    raise TypeError(f"a {type(value).__name__} cannot be part of a snapshot")
+class _Writer:
+    """Turns values into JSON; the bytes of arrays go into `chunks`, and a shared camera is written once."""
+
+    def __init__(self) -> None:
+        self.chunks: list[bytes] = []
+        self._cameras: dict[int, int] = {}  # by the identity of the object
+
+    def packed(self, value: Any) -> Any:
+        if isinstance(value, Enum):
+            return {"type": type(value).__name__, "value": value.value}
+        if value is None or isinstance(value, bool | int | float | str):
+            return value
+        if isinstance(value, np.generic):
+            return value.item()
+        if isinstance(value, np.ndarray):
+            self.chunks.append(np.ascontiguousarray(value).tobytes())
+            return {"array": value.dtype.name, "shape": value.shape}
+        if isinstance(value, list | tuple):
+            return {type(value).__name__: [self.packed(item) for item in value]}
+        if isinstance(value, Mapping):
+            return {"dict": [[self.packed(k), self.packed(v)] for k, v in value.items()]}
+        if isinstance(value, pycolmap.Camera):
+            return self._camera(value)
+        if is_dataclass(value) and type(value).__name__ in _TYPES:
+            record = {f.name: self.packed(getattr(value, f.name)) for f in fields(value)}
+            return {"type": type(value).__name__, "fields": record}
+        raise TypeError(f"a {type(value).__name__} cannot be part of a snapshot")
+
+    def _camera(self, camera: pycolmap.Camera) -> dict[str, Any]:
+        if id(camera) in self._cameras:
+            return {"same_camera": self._cameras[id(camera)]}
+        self._cameras[id(camera)] = len(self._cameras)
+        return {"camera": camera_to_json(camera), "focal_told": camera.has_prior_focal_length}
 
 
 class _Reader:
@@ -107,6 +123,7 @@ class _Reader:
     def __init__(self, data: bytes) -> None:
         self._data = data
         self._position = 0
+        self._cameras: list[pycolmap.Camera] = []
 
     def value(self, packed: Any) -> Any:
         if not isinstance(packed, dict):
@@ -119,6 +136,12 @@ class _Reader:
             return tuple(self.value(item) for item in packed["tuple"])
         if "dict" in packed:
             return {self.value(key): self.value(item) for key, item in packed["dict"]}
+        if "camera" in packed:
+            self._cameras.append(camera_from_json(packed["camera"]))
+            self._cameras[-1].has_prior_focal_length = packed["focal_told"]
+            return self._cameras[-1]
+        if "same_camera" in packed:
+            return self._cameras[packed["same_camera"]]
         if "fields" in packed:
             return _TYPES[packed["type"]](**{name: self.value(item) for name, item in packed["fields"].items()})
         return _TYPES[packed["type"]](packed["value"])

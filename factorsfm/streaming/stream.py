@@ -17,9 +17,9 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.camera.files import camera_from_json, camera_to_json, check_camera
+from factorsfm.camera.files import check_camera
 from factorsfm.camera.guess import first_focal_std, guess_camera
-from factorsfm.camera.projection import normalized_from_pixels, with_focal
+from factorsfm.camera.projection import normalized_from_pixels
 from factorsfm.control.known import Control, LocatedControl, locate
 from factorsfm.frames.frame import Frame, as_frame
 from factorsfm.frames.texture import BLANK_TEXTURE
@@ -51,7 +51,7 @@ from factorsfm.tracks.image_tracks import ImageTracks
 
 logger = logging.getLogger(__name__)
 
-_STATE = ("_size", "_lens_given", "_pixels", "_without_depth")
+_STATE = ("camera", "_size", "_lens_given", "_without_depth")
 _LEAST_SIDE = 32  # pixels: room for the patches of the tracker
 
 
@@ -108,7 +108,6 @@ class Stream(Closing):
         self._mapper: Mapper | None = None
         self._size = (0, 0)
         self._colors = TrackColors()
-        self._pixels: list[NDArray[np.float64]] = []
         self._without_depth: dict[int, str] = {}  # why the prior failed, by the frame's index
 
     def push(self, frame: Frame | NDArray[np.uint8]) -> FrameUpdate:
@@ -134,27 +133,23 @@ class Stream(Closing):
             mask = read_mask(self._masks, frame)
         with self._timed("tracking"):
             grey = np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY), np.uint8)
-            tracked = self._tracker.track(grey, mask, self._finder.expected(mapper, self.camera))
+            tracked = self._tracker.track(grey, mask, self._finder.expected(mapper))
         self._colors.remember(frame.image, tracked.ids, tracked.xy)
         with self._timed("mapping"):
             mapper.advance()
         focal_changed |= self._follow_focal(mapper)
-        xy = normalized_from_pixels(self.camera, tracked.xy)
-        usable = np.isfinite(xy).all(axis=1)  # a distortion model may have no inverse in the corners
-        usable &= tracked.texture >= BLANK_TEXTURE  # what is tracked in a blank image is its noise
-        pixels = tracked.xy[usable]
-        tracks = ImageTracks(len(self.frames), tracked.ids[usable], xy[usable])
+        tracks = ImageTracks(len(self.frames), tracked.ids, tracked.xy, self.camera)
+        tracks = tracks.of(tracks.invertible & (tracked.texture >= BLANK_TEXTURE))  # a blank image's tracks are noise
         with self._timed("mapping"):
-            image = mapper.add(tracks, lambda: self._read_depth(frame, pixels))
+            image = mapper.add(tracks, lambda: self._read_depth(frame, tracks.pixels))
         focal_changed |= self._follow_focal(mapper)
         self.frames.append(SeenFrame(frame.index, frame.name, frame.timestamp, tracked.texture))
-        self._pixels.append(pixels)
         self._thumbnails.add(frame.image)
         if len(mapper.burn_ins):
             self._tracker.avoid(mapper.burn_ins)
             self._forget(mapper, mapper.burn_ins)
         with self._timed("relocalization"):
-            self._pixels[-1] = self._finder.keep_in_sight(mapper, image, grey, self._pixels[-1], self.camera)
+            self._finder.keep_in_sight(mapper, image, grey)
         if image.status is not FrameStatus.WAITING:  # it may still take part in the start
             _mark_blank(image, tracked.texture)
         return self._frame_update(frame, image, focal_changed)
@@ -180,9 +175,10 @@ class Stream(Closing):
     @property
     def tracks(self) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """(n, 2) tracked points of the newest frame (pixels), and (n,) whether the map holds them."""
-        if self._mapper is None or not self._pixels:
+        if self._mapper is None or not self._mapper.images:
             return np.zeros((0, 2)), np.zeros(0, bool)
-        return self._pixels[-1], self._mapper.points.contains(self._mapper.images[-1].tracks.ids)
+        tracks = self._mapper.images[-1].tracks
+        return tracks.pixels, self._mapper.points.contains(tracks.ids)
 
     def save(self, path: str | Path) -> None:
         """Write everything that is known so far as one file, whole or not at all; the stream can go on.
@@ -194,8 +190,6 @@ class Stream(Closing):
             Path(path),
             {
                 **{name: getattr(self, name) for name in _STATE},
-                "camera": camera_to_json(self.camera) if self.camera is not None else None,
-                "focal_told": self.camera is not None and self.camera.has_prior_focal_length,
                 "options": self.options.to_dict(),
                 "seconds": dict(self.seconds),
                 "frames": [astuple(frame) for frame in self.frames],
@@ -229,9 +223,6 @@ class Stream(Closing):
     def _restore(self, state: dict[str, Any]) -> None:
         for name in _STATE:
             setattr(self, name, state[name])
-        if state["camera"] is not None:
-            self.camera = camera_from_json(state["camera"])
-            self.camera.has_prior_focal_length = state["focal_told"]
         self.seconds.update(state["seconds"])
         self.frames = [SeenFrame(*frame) for frame in state["frames"]]
         self._tracker.restore(state["tracker"])
@@ -288,7 +279,6 @@ class Stream(Closing):
             result,
             mapper.images,
             self.frames,
-            self._pixels,
             self._colors.table,
             self.camera,
             lens_given=self._lens_given,
@@ -325,10 +315,10 @@ class Stream(Closing):
 
     def _forget(self, mapper: Mapper, ids: NDArray[np.int64]) -> None:
         """Tracks are left out of the images before the newest, which the graph may be working on."""
-        for k, image in enumerate(mapper.images[:-1]):
+        for image in mapper.images[:-1]:
             keep = ~np.isin(image.tracks.ids, ids)
             if not keep.all():
-                image.tracks, self._pixels[k] = image.tracks.of(keep), self._pixels[k][keep]
+                image.tracks = image.tracks.of(keep)
 
     def _open(self, frame: Frame) -> Mapper:
         """Everything that waits for the size of the first frame."""
@@ -346,11 +336,11 @@ class Stream(Closing):
         return self._mapper
 
     def _follow_focal(self, mapper: Mapper) -> bool:
-        """Take over the focal length with which the mapper normalises; whether it is another one."""
+        """Take over the camera of the mapper's images; whether it has another focal length."""
         assert self.camera is not None
         if math.isclose(mapper.focal, self.camera.mean_focal_length(), rel_tol=1e-12):
             return False
-        self.camera = with_focal(self.camera, mapper.focal)
+        self.camera = mapper.images[-1].tracks.camera
         return True
 
     def _new_mapper(self) -> Mapper:

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.camera.projection import normalized_from_pixels, pixels_from_normalized
+from factorsfm.camera.projection import pixels_from_normalized
 from factorsfm.mapping.map_registration import visible
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.mapping.mapper import Mapper
@@ -33,38 +32,30 @@ class ViewFinder:
         self._tracker = tracker
         self.relocalizer = Relocalizer(views, next_view)
 
-    def expected(self, mapper: Mapper, camera: pycolmap.Camera) -> tuple[Index, Array] | None:
+    def expected(self, mapper: Mapper) -> tuple[Index, Array] | None:
         """Now and then, the ended tracks that the last image should show, and where (pixels)."""
         last = mapper.images[-1] if mapper.images else None
         if last is None or not last.registered or len(mapper.images) % _REVIVAL_INTERVAL:
             return None
-        return self._in_view(mapper, last, camera)
+        return self._in_view(mapper, last)
 
-    def keep_in_sight(
-        self, mapper: Mapper, image: MappedImage, grey: NDArray[np.uint8], pixels: Array, camera: pycolmap.Camera
-    ) -> Array:
+    def keep_in_sight(self, mapper: Mapper, image: MappedImage, grey: NDArray[np.uint8]) -> None:
         """Find the view of the newest image again if it was lost, and take up the tracks whose points it shows.
 
         Args:
-            grey: the image, (h, w); pixels: (n, 2) of its tracks.
-
-        Returns:
-            (m, 2) pixels of its tracks with those that were taken up.
+            grey: the image, (h, w).
         """
         if image.keyframe:
-            self.relocalizer.remember(grey, image.tracks.ids, pixels)
+            self.relocalizer.remember(grey, image.tracks.ids, image.tracks.pixels)
         if not mapper.started or image.registered:
-            return pixels
-        ids, rows = self.relocalizer.find(grey, pixels)
+            return
+        ids, rows = self.relocalizer.find(grey, image.tracks.pixels)
         if not mapper.relocalize(image, ids, image.tracks.xy[rows]):
-            return pixels
-        revived, xy = self._tracker.revive(grey, *self._in_view(mapper, image, camera))
-        joined = image.tracks.joined(revived, normalized_from_pixels(camera, xy))
-        order = np.argsort(joined.ids)
-        image.tracks = joined.of(order)
-        return np.asarray(np.r_[pixels, xy][order])
+            return
+        joined = image.tracks.joined(*self._tracker.revive(grey, *self._in_view(mapper, image)))
+        image.tracks = joined.of(np.argsort(joined.ids))
 
-    def _in_view(self, mapper: Mapper, image: MappedImage, camera: pycolmap.Camera) -> tuple[Index, Array]:
+    def _in_view(self, mapper: Mapper, image: MappedImage) -> tuple[Index, Array]:
         """Ended tracks with a point in front of an image, and where it is seen (pixels)."""
         ids, xy = visible(image, mapper.points, self._tracker.ended)
-        return ids, pixels_from_normalized(camera, xy)
+        return ids, pixels_from_normalized(image.tracks.camera, xy)

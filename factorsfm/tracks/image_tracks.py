@@ -3,42 +3,57 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 
+from factorsfm.camera.projection import normalized_from_pixels
 from factorsfm.priors.image_depth import ImageDepth
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class ImageTracks:
-    """What the mapper knows of an image: its tracks, and the depth prior at them where it has one.
+    """The measurements of one image: its tracks, and the depth prior at them where it has one.
 
     Attributes:
         position: index among the frames seen.
         ids: (n,) identities of the tracks, ascending.
-        xy: (n, 2) undistorted normalised image coordinates.
+        pixels: (n, 2) keypoints, in pixels of the camera with centres at integers.
+        camera: of the image; another focal length is another camera, the pixels stay.
         depth: prior at the n keypoints.
     """
 
     position: int
     ids: Index
-    xy: Array
+    pixels: Array
+    camera: pycolmap.Camera
     depth: ImageDepth | None = None
 
-    def joined(self, ids: NDArray[np.int64], xy: Array) -> ImageTracks:
+    @cached_property
+    def xy(self) -> Array:
+        """(n, 2) undistorted normalised image coordinates; NaN where the lens model cannot be inverted."""
+        return normalized_from_pixels(self.camera, self.pixels)
+
+    @property
+    def invertible(self) -> NDArray[np.bool_]:
+        """(n,) keypoints that the camera has a ray for: a distortion model may have no inverse in the corners."""
+        return np.asarray(np.isfinite(self.xy).all(axis=1))
+
+    def joined(self, ids: NDArray[np.int64], pixels: Array) -> ImageTracks:
         """With further tracks behind the others, of which the prior says nothing."""
         depth = self.depth.padded(len(ids)) if self.depth is not None else None
-        return ImageTracks(self.position, np.r_[self.ids, ids], np.r_[self.xy, xy], depth)
+        return replace(self, ids=np.r_[self.ids, ids], pixels=np.r_[self.pixels, pixels], depth=depth)
 
     def of(self, kept: NDArray[np.bool_] | NDArray[np.intp]) -> ImageTracks:
         """Some of the n tracks, or all in another order."""
         depth = self.depth.of(kept) if self.depth is not None else None
-        return ImageTracks(self.position, self.ids[kept], self.xy[kept], depth)
+        return replace(self, ids=self.ids[kept], pixels=self.pixels[kept], depth=depth)
 
 
 def seen_by(images: Sequence[ImageTracks], least: int) -> Index:

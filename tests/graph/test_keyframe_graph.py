@@ -139,7 +139,7 @@ def test_noise_costs_what_it_should():
 def test_outliers_are_tolerated():
     shot = Shot("truck")
     for image in shot.images:
-        image.tracks.xy[image.tracks.position :: 23] += 0.02  # 12 pixels
+        image.tracks.pixels[image.tracks.position :: 23] += 12.0
     found = errors(shot.run())
     assert (found < [1e-4, 5e-4, 1e-2]).all()
     assert (found > 1e-8).all()
@@ -253,12 +253,12 @@ def turned_away(image):
 
 
 def wrong_tracks(image):
-    xy = np.random.default_rng(0).permutation(image.tracks.xy)
-    image.tracks = replace(image.tracks, xy=xy, depth=None)
+    pixels = np.random.default_rng(0).permutation(image.tracks.pixels)
+    image.tracks = replace(image.tracks, pixels=pixels, depth=None)
 
 
 def no_observations(image):
-    image.tracks = replace(image.tracks, ids=image.tracks.ids[:0], xy=image.tracks.xy[:0], depth=None)
+    image.tracks = replace(image.tracks.of(np.arange(0)), depth=None)
 
 
 def not_finite(image):
@@ -308,7 +308,7 @@ def test_a_keyframe_that_hardly_anything_holds_says_so():
     """Whether it sees enough is the mapper's question; the covariance has no doubt."""
     shot = Shot("handheld", noise_px=0.1).run(4)
     tracks = shot.images[4].tracks
-    shot.images[4].tracks = replace(tracks, ids=tracks.ids[:1], xy=tracks.xy[:1], depth=None)
+    shot.images[4].tracks = replace(tracks.of(np.arange(1)), depth=None)
     result = shot.update(range(5))
     if result.committed:
         assert np.diag(result.covariance[4])[3:].max() > 1.0

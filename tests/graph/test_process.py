@@ -102,7 +102,7 @@ def test_what_is_left_out_of_a_request_makes_no_difference(graph):
     shot = Shot(frames=34)
     for k, image in enumerate(shot.images[:14]):  # the constant ones that share most, and one that shares too little
         seen = len(image.tracks.ids) - 5 * k if k != 6 else 10
-        image.tracks = replace(image.tracks, ids=image.tracks.ids[:seen], xy=image.tracks.xy[:seen], depth=None)
+        image.tracks = replace(image.tracks.of(image.tracks.ids < seen), depth=None)
     shot.points.set(5000 + np.arange(100), np.ones((100, 3)))  # what none of these keyframes sees
     assert len(shot.copy(34).needed().keyframes) == 28
     update = submit_update(graph, shot.copy(34), None).result()

@@ -23,6 +23,7 @@ from factorsfm import (
 )
 from factorsfm.camera.files import camera_to_json
 from factorsfm.camera.guess import guess_camera
+from factorsfm.camera.projection import with_focal
 from factorsfm.cli import main as cli
 from factorsfm.evaluation.baselines import colmap_default, match_frames
 from factorsfm.evaluation.metrics import TrajectoryErrors, auc, relative_pose_errors, trajectory_errors
@@ -38,6 +39,7 @@ from factorsfm.priors.image_depth import ImageDepth
 from factorsfm.support.similarity import pose_arrays
 from factorsfm.synthetic import RenderedShot, render_shot, render_views, room_camera
 from factorsfm.tracks.image_tracks import ImageTracks
+from tests.estimation_problems import tracks_at
 from tests.photographs import photographs
 
 FOCAL = 800.0
@@ -74,7 +76,7 @@ class Ring:
             xy = q[:, :2] / q[:, 2:] + self.generator.normal(0.0, noise_px / FOCAL, (len(rows), 2))
             bad = self.generator.random(len(rows)) < wrong
             xy[bad] = self.generator.uniform(-0.4, 0.4, (int(bad.sum()), 2))
-            tracks.append(ImageTracks(first + k, self.ids[rows], xy))
+            tracks.append(tracks_at(first + k, self.ids[rows], xy, focal=FOCAL))
         return tracks
 
     def errors(self, rotation: np.ndarray, translation: np.ndarray) -> TrajectoryErrors:
@@ -170,7 +172,7 @@ def test_what_no_pose_joins_to_the_map_is_started_anew() -> None:
     for t in small.tracks(first=7):
         ids = np.sort(generator.choice(large.ids, 60, replace=False))
         xy = generator.uniform(-0.4, 0.4, (60, 2))
-        tracks.append(ImageTracks(t.position, np.concatenate([ids, t.ids]), np.concatenate([xy, t.xy])))
+        tracks.append(tracks_at(t.position, np.concatenate([ids, t.ids]), np.concatenate([xy, t.xy])))
     first, second = map_parts(tracks, FOCAL, Options())
     assert registered(first) == list(range(7))
     assert registered(second) == [7, 8, 9, 10]
@@ -182,8 +184,7 @@ def test_what_no_pose_joins_to_the_map_is_started_anew() -> None:
 def test_an_image_of_wrong_matches_is_not_registered() -> None:
     ring = Ring(6)
     tracks = ring.tracks()
-    xy = np.random.default_rng(5).uniform(-0.4, 0.4, tracks[2].xy.shape)
-    tracks[2] = replace(tracks[2], xy=xy)
+    tracks[2] = tracks_at(2, tracks[2].ids, np.random.default_rng(5).uniform(-0.4, 0.4, tracks[2].xy.shape))
     mapper = SetMapper(tracks, FOCAL, Options())
     mapper.run()
     assert [image.registered for image in mapper.images] == [True, True, False, True, True, True]
@@ -194,7 +195,7 @@ def test_an_image_of_wrong_matches_is_not_registered() -> None:
 def test_a_guessed_focal_length_is_corrected_with_the_map() -> None:
     ring = Ring(8)
     guess = 1.2 * FOCAL
-    tracks = [replace(t, xy=t.xy * FOCAL / guess) for t in ring.tracks()]
+    tracks = [replace(t, camera=with_focal(t.camera, guess)) for t in ring.tracks()]
     result = solve(tracks, Options(lens="focal"), guess)
     assert result.state.focal[0] == pytest.approx(FOCAL, rel=0.003)
     assert np.median(ring.errors(result.state.rotation, result.state.translation).ate) < 3e-3
@@ -211,7 +212,7 @@ def nearby_tracks(with_depth: bool) -> tuple[list[ImageTracks], np.ndarray]:
         xy = q[:, :2] / q[:, 2:] + generator.normal(0.0, 0.1 / FOCAL, (800, 2))
         inverse = 1.0 / q[:, 2] * generator.normal(1.0, 0.05, 800)
         depth = ImageDepth(inverse / np.median(inverse), np.ones(800), float(np.median(inverse)))
-        tracks.append(ImageTracks(k, np.arange(800), xy, depth if with_depth else None))
+        tracks.append(tracks_at(k, np.arange(800), xy, depth if with_depth else None))
     return tracks, centers
 
 
@@ -234,8 +235,8 @@ def test_an_image_that_sees_too_little_of_the_map_is_told_so() -> None:
     own = np.arange(50_000, 50_040)  # seen by two images that cannot be registered together: they are as one
     xy = np.random.default_rng(3).uniform(-0.4, 0.4, (40, 2))
     neighbour = tracks[5]
-    tracks[5] = ImageTracks(5, np.concatenate([neighbour.ids, own]), np.concatenate([neighbour.xy, xy]))
-    tracks.append(ImageTracks(6, own, np.random.default_rng(4).uniform(-0.4, 0.4, (40, 2))))
+    tracks[5] = tracks_at(5, np.concatenate([neighbour.ids, own]), np.concatenate([neighbour.xy, xy]))
+    tracks.append(tracks_at(6, own, np.random.default_rng(4).uniform(-0.4, 0.4, (40, 2))))
     mapper = SetMapper(tracks, FOCAL, Options())
     mapper.run()
     assert registered(mapper) == list(range(6))
@@ -246,14 +247,14 @@ def test_an_image_that_sees_too_little_of_the_map_is_told_so() -> None:
 def test_tracks_in_common_are_counted_for_every_pair() -> None:
     generator = np.random.default_rng(6)
     ids = [np.sort(generator.choice(300, size, replace=False)) for size in (120, 80, 0, 200)]
-    tracks = [ImageTracks(k, i, np.zeros((len(i), 2))) for k, i in enumerate(ids)]
+    tracks = [tracks_at(k, i, np.zeros((len(i), 2))) for k, i in enumerate(ids)]
     expected = [[len(set(a) & set(b)) if a is not b else 0 for b in ids] for a in ids]
     np.testing.assert_array_equal(common_tracks(tracks), expected)
 
 
 def test_the_longest_tracks_of_every_image() -> None:
     ids = [np.array([0, 1, 2, 7]), np.array([1, 2, 3]), np.array([2, 3, 5])]
-    tracks = [ImageTracks(k, i, np.zeros((len(i), 2))) for k, i in enumerate(ids)]
+    tracks = [tracks_at(k, i, np.zeros((len(i), 2))) for k, i in enumerate(ids)]
     assert longest_tracks(tracks, 2).tolist() == [1, 2, 3]  # 2 is seen thrice, 1 and 3 twice
 
 
@@ -269,7 +270,7 @@ def test_keypoints_that_are_spread_score_more() -> None:
 
 
 def test_too_little_in_common_is_no_start() -> None:
-    tracks = [ImageTracks(k, 100 * k + np.arange(100), np.zeros((100, 2))) for k in range(3)]
+    tracks = [tracks_at(k, 100 * k + np.arange(100), np.zeros((100, 2))) for k in range(3)]
     mapper = SetMapper(tracks, FOCAL, Options())
     mapper.run()
     assert not any(image.registered for image in mapper.images)

@@ -22,8 +22,7 @@ from factorsfm.support.errors import InputError
 from factorsfm.support.options import Options, PolishOptions
 from factorsfm.support.status import FrameStatus, ShotKind
 from factorsfm.synthetic import read_by_rows, render_shot
-from factorsfm.tracks.image_tracks import ImageTracks
-from tests.estimation_problems import angles_between, make_problem, mapped_images, rotation_matrices
+from tests.estimation_problems import angles_between, make_problem, mapped_images, rotation_matrices, tracks_at
 from tests.rendered import errors_of
 
 WIDTH, HEIGHT = 640, 360
@@ -194,7 +193,7 @@ def test_motion_is_seen_in_the_images_before_and_after():
     for position, ids in enumerate((np.arange(0, 25), np.arange(0, 31), np.arange(5, 30))):
         time = times[position] - 2
         xy = x[ids] + motion[ids] * time + 0.5 * acceleration[ids] * time**2
-        images.append(MappedImage(ImageTracks(position, ids, xy), FrameStatus.REGISTERED, ""))
+        images.append(MappedImage(tracks_at(position, ids, xy), FrameStatus.REGISTERED, ""))
     o = Observations(np.zeros(31, np.int64), np.arange(31), x)
     recording, group = Recording(200, 50, times), np.zeros(1, np.int64)
     sweep = with_sweep(o, np.arange(31), images, [1], Lens(np.array([100.0])), group, recording).sweep

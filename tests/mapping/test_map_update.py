@@ -13,8 +13,7 @@ from factorsfm.mapping.point_map import PointMap
 from factorsfm.mapping.registration import register_image
 from factorsfm.support.options import MapperOptions
 from factorsfm.support.status import FrameStatus
-from factorsfm.tracks.image_tracks import ImageTracks
-from tests.estimation_problems import angles_between, image_depth, make_problem, mapped_images, perturbed
+from tests.estimation_problems import angles_between, image_depth, make_problem, mapped_images, perturbed, tracks_at
 
 OPTIONS = MapperOptions(landmarks=200)
 
@@ -79,7 +78,7 @@ def long_shot():
     images = mapped_images(problem, problem.truth)
     for k, image in enumerate(images[:10]):
         seen = len(problem.points) - 5 * k if k < 9 else 10
-        image.tracks = replace(image.tracks, ids=image.tracks.ids[:seen], xy=image.tracks.xy[:seen])
+        image.tracks = image.tracks.of(image.tracks.ids < seen)
     return problem, images
 
 
@@ -97,7 +96,7 @@ def test_of_a_long_shot_the_newest_keyframes_and_the_constant_ones_that_share_mo
 def test_without_a_constant_keyframe_the_oldest_two_of_the_window_are_constant():
     problem, images = long_shot()
     for image in images[:10]:
-        image.tracks = replace(image.tracks, ids=image.tracks.ids[:29], xy=image.tracks.xy[:29])
+        image.tracks = image.tracks.of(image.tracks.ids < 29)
     update = update_map(copy_of(problem, images, map_of(problem.points)), graph := Recorder())
     assert graph.positions == list(range(10, 30))
     assert graph.held == 2 * [True] + 18 * [False]
@@ -118,7 +117,7 @@ def test_landmarks_are_what_two_keyframes_see():
     n = len(points)
     for k, image in enumerate(images):
         ids = np.append(image.tracks.ids[5:], n + k)  # the last one is its own; the first five nobody sees
-        image.tracks = replace(image.tracks, ids=ids, xy=np.append(image.tracks.xy[5:], [[0.0, 0.0]], 0))
+        image.tracks = tracks_at(k, ids, np.append(image.tracks.xy[5:], [[0.0, 0.0]], 0))
     mapped = map_of(points)
     mapped.set(n + np.arange(6), np.ones((6, 3)))
     update = update_map(copy_of(problem, images, mapped), graph := Recorder())
@@ -185,8 +184,8 @@ def test_covariances_cover_the_errors():
     problem, images = long_shot()
     rng = np.random.default_rng(0)
     for image in images:
-        xy = image.tracks.xy + 0.25 / problem.focal * rng.standard_normal(image.tracks.xy.shape)
-        image.tracks = replace(image.tracks, xy=xy)
+        noise = 0.25 * rng.standard_normal(image.tracks.pixels.shape)
+        image.tracks = replace(image.tracks, pixels=image.tracks.pixels + noise)
     update = update_map(copy_of(problem, images, map_of(problem.points)), FactorGraph())
     truth = problem.truth
     errors = []
@@ -258,7 +257,7 @@ def test_a_track_of_one_keyframe_is_no_point_yet():
     problem, _, _ = handheld()
     images = mapped_images(problem, problem.truth)
     for image in images[:5]:
-        image.tracks = replace(image.tracks, ids=image.tracks.ids[:-1], xy=image.tracks.xy[:-1])
+        image.tracks = image.tracks.of(np.arange(len(image.tracks.ids) - 1))
     n = len(problem.points)
     update = update_map(copy_of(problem, images, map_of(problem.points, np.arange(20))), FactorGraph())
     np.testing.assert_array_equal(update.ids, np.arange(n - 1))
@@ -269,8 +268,8 @@ def test_a_track_of_one_keyframe_is_no_point_yet():
 
 def test_an_observation_that_is_elsewhere_takes_no_point_away():
     problem, images, points = handheld()
-    images[5].tracks.xy[[3, 17], 0] += 25 / problem.focal
-    images[2].tracks.xy[8, 0] += 25 / problem.focal
+    images[5].tracks.pixels[[3, 17], 0] += 25
+    images[2].tracks.pixels[8, 0] += 25
     update = update_map(copy_of(problem, images, map_of(points)), FactorGraph())
     assert len(update.removed) == 0  # the other views hold the points
 
@@ -279,7 +278,7 @@ def test_a_point_that_holds_nowhere_is_removed():
     problem, images, points = handheld()
     rng = np.random.default_rng(0)
     for image in images:
-        image.tracks.xy[4] = rng.uniform(-0.3, 0.3, 2)  # never the same thing
+        image.tracks.pixels[4] = [320, 180] + problem.focal * rng.uniform(-0.3, 0.3, 2)  # never the same thing
     mapped = map_of(points)
     update = update_map(copy_of(problem, images, mapped), FactorGraph())
     assert update.committed
@@ -344,7 +343,7 @@ def test_the_prior_takes_no_part_in_the_graph_where_it_is_switched_off():
 
 def test_too_few_landmarks():
     problem, images, points = handheld()
-    images[5].tracks = replace(images[5].tracks, ids=images[5].tracks.ids[:14], xy=images[5].tracks.xy[:14])
+    images[5].tracks = images[5].tracks.of(np.arange(14))
     update = update_map(copy_of(problem, images, map_of(points)), graph := Recorder())
     assert (update.committed, update.reason) == (False, "14 of 15 needed landmarks in the keyframe")
     assert not hasattr(graph, "positions")
@@ -391,7 +390,7 @@ def run(problem, *, depth=True, noise=0.0, frames=None):
     keyframes = []
     for k in range(0, problem.frames, 3):
         ids, xy = problem.of_frame(k)
-        image = MappedImage(ImageTracks(k, ids, xy), FrameStatus.REGISTERED, "", np.eye(3), np.zeros(3))
+        image = MappedImage(tracks_at(k, ids, xy), FrameStatus.REGISTERED, "", np.eye(3), np.zeros(3))
         if keyframes:
             near = keyframes[-1].pose
             known = points.contains(ids)

@@ -1,5 +1,7 @@
 """Images that the map loses, on synthetic tracks whose cameras are known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,8 +10,7 @@ from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.mapping.mapper import Mapper
 from factorsfm.support.options import Options
 from factorsfm.support.status import FrameStatus
-from factorsfm.tracks.image_tracks import ImageTracks
-from tests.estimation_problems import angles_between, make_problem
+from tests.estimation_problems import angles_between, make_problem, tracks_at
 
 
 def lost_at_both_ends(problem, known, life):
@@ -19,7 +20,7 @@ def lost_at_both_ends(problem, known, life):
     for k in range(problem.frames):
         ids, xy = problem.of_frame(k)
         alive = (born[ids] <= k) & (k < born[ids] + life)
-        tracks = ImageTracks(k, ids[alive], xy[alive])
+        tracks = tracks_at(k, ids[alive], xy[alive])
         image = MappedImage(tracks, FrameStatus.LOST, "0 of 15 needed tracks have a point in the map")
         if k in known:
             image.status = FrameStatus.REGISTERED
@@ -53,7 +54,7 @@ def test_images_that_share_no_track_with_the_map_stay_lost_and_say_why():
     problem = make_problem("truck", frames=12, points=200, parallax=0.3)
     mapper = lost_at_both_ends(problem, range(6), life=12)
     for image in mapper.images[9:]:
-        image.tracks = ImageTracks(image.tracks.position, image.tracks.ids + 1000, image.tracks.xy)
+        image.tracks = replace(image.tracks, ids=image.tracks.ids + 1000)
         image.message = "something else"
     mapper.finish()
     assert [image.registered for image in mapper.images] == 9 * [True] + 3 * [False]
@@ -74,7 +75,7 @@ def test_rotations_stay_rotations_however_long_the_shot():
     problem = make_problem("truck", frames=160, points=300, parallax=0.9)
     mapper = Mapper(GraphProcess(), problem.focal, 640, Options.preset_named("geometry"), has_prior=False)
     for k in range(problem.frames):
-        mapper.add(ImageTracks(k, *problem.of_frame(k)), lambda: None)
+        mapper.add(tracks_at(k, *problem.of_frame(k)), lambda: None)
     mapper.close()
     assert len(mapper.keyframes) > 20
     rotation = np.array([image.rotation for image in mapper.images])

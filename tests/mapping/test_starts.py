@@ -5,8 +5,7 @@ import pytest
 
 from factorsfm.mapping.starts import NoStart, Start, lift, start_essential, start_lifted, start_pair
 from factorsfm.priors.image_depth import ImageDepth
-from factorsfm.tracks.image_tracks import ImageTracks
-from tests.estimation_problems import angles_between, make_problem
+from tests.estimation_problems import angles_between, make_problem, tracks_at
 
 PAIR = {"focal": 628.0, "sigma": 0.25, "inlier_px": 3.0}
 
@@ -18,7 +17,7 @@ def image_of(problem, frame, *, depth=True, position=None):
     if depth:
         inverse = 1 / problem.depth(frame, ids)
         prior = ImageDepth(inverse / np.median(inverse), np.ones(len(ids)), unit=np.median(inverse))
-    return ImageTracks(frame if position is None else position, ids * 3 + 1, xy, prior)
+    return tracks_at(frame if position is None else position, ids * 3 + 1, xy, prior, focal=problem.focal)
 
 
 def essential(problem, frame, **kwargs):
@@ -108,7 +107,7 @@ def test_the_pair_with_most_valid_matches_is_chosen():
     images[0].depth.inverse_depth[:40] = np.nan  # most matches, but with less depth
     images[1] = replace(images[1], depth=None)
     few = np.arange(len(problem.points) - 10)
-    images[3] = replace(images[3], ids=images[3].ids[few], xy=images[3].xy[few], depth=None)
+    images[3] = replace(images[3].of(few), depth=None)
     start = start_pair(images, 30, **PAIR)
     assert isinstance(start, Start)
     assert start.images[0] == 2
@@ -119,7 +118,7 @@ def test_outliers_of_the_pair():
     problem = make_problem("truck", points=200, noise_px=0.25)
     images = [image_of(problem, 0), image_of(problem, 9)]
     rng = np.random.default_rng(0)
-    images[1].xy[::5] += rng.choice([-0.1, 0.1], images[1].xy[::5].shape)
+    images[1].pixels[::5] += problem.focal * rng.choice([-0.1, 0.1], images[1].pixels[::5].shape)
     images[0].depth.inverse_depth[1::7] *= rng.choice([0.5, 1.5], images[0].depth.inverse_depth[1::7].shape)
     start = start_pair(images, 30, **PAIR)
     assert isinstance(start, Start)
@@ -133,7 +132,7 @@ def test_why_there_is_no_pair():
     no_depth = start_pair([replace(i, depth=None) for i in images], 30, **PAIR)
     assert isinstance(no_depth, NoStart)
     assert no_depth.reason == "the best pair has 0 of 30 needed matches with a valid depth"
-    shuffled = replace(images[1], xy=np.random.default_rng(0).permutation(images[1].xy))
+    shuffled = replace(images[1], pixels=np.random.default_rng(0).permutation(images[1].pixels))
     nonsense = start_pair([images[0], shuffled], 60, **PAIR)
     assert isinstance(nonsense, NoStart)
     assert "of 30 needed inliers" in nonsense.reason
@@ -193,7 +192,7 @@ def test_too_few_shared_tracks_are_no_start():
     problem = make_problem("truck", parallax=0.2)
     first, second = image_of(problem, 0), image_of(problem, 9)
     strangers = replace(second, ids=second.ids + 10_000)
-    for other, shared in [(strangers, 0), (replace(second, ids=second.ids[:20], xy=second.xy[:20]), 20)]:
+    for other, shared in [(strangers, 0), (second.of(np.arange(20)), 20)]:
         start = start_essential(first, other, 30, focal=problem.focal, sigma=0.25, angle_deg=1.0)
         assert isinstance(start, NoStart)
         assert start.reason == f"{shared} of 30 needed tracks join frames 0 and 9"

@@ -8,7 +8,6 @@ import pytest
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.observations import Observations
 from factorsfm.mapping.mapped_images import MappedImage
-from factorsfm.mapping.starts import ImageTracks
 from factorsfm.polish.camera_starts import converge_cameras, in_front
 from factorsfm.polish.connected_frames import connected_frames
 from factorsfm.polish.polish import polish
@@ -16,7 +15,7 @@ from factorsfm.polish.start import with_all_points
 from factorsfm.support.errors import ReconstructionError
 from factorsfm.support.options import Options
 from factorsfm.support.status import FrameStatus, ShotKind
-from tests.estimation_problems import angles_between, in_unit_of, make_problem
+from tests.estimation_problems import angles_between, in_unit_of, make_problem, tracks_at
 
 
 def images_of(problem, state):
@@ -24,7 +23,7 @@ def images_of(problem, state):
     images = []
     for k in range(len(state.rotation)):
         ids, xy = problem.of_frame(k)
-        image = MappedImage(ImageTracks(k, ids, xy), FrameStatus.REGISTERED, "")
+        image = MappedImage(tracks_at(k, ids, xy), FrameStatus.REGISTERED, "")
         image.rotation, image.translation = state.rotation[k], state.translation[k]
         images.append(image)
     return images
@@ -133,7 +132,7 @@ def with_dark_frames(images, dark, kept=0):
         tracks = images[k].tracks
         ids = np.concatenate([tracks.ids[:kept], 10_000 + np.arange(300)])
         noise = rng.uniform(-0.4, 0.4, (300, 2))
-        images[k].tracks = replace(tracks, ids=ids, xy=np.concatenate([tracks.xy[:kept], noise]))
+        images[k].tracks = tracks_at(k, ids, np.concatenate([tracks.xy[:kept], noise]))
     return images
 
 

@@ -203,8 +203,9 @@ def test_all_frames_are_seen_through_one_focal_length_whenever_the_map_changes_i
         changed.append(update.focal_changed)
         assert update.focal_length == pytest.approx(s.camera.mean_focal_length(), rel=1e-12)
     assert changed == [False] + [True] * 7
-    for image, pixels in zip(s._mapper.images, s._pixels, strict=True):
-        np.testing.assert_allclose(pixels_from_normalized(s.camera, image.tracks.xy), pixels, atol=1e-6)
+    for image in s._mapper.images:
+        assert image.tracks.camera == s.camera
+        np.testing.assert_allclose(pixels_from_normalized(s.camera, image.tracks.xy), image.tracks.pixels, atol=1e-6)
     s.close()
 
 
@@ -355,7 +356,7 @@ def test_no_pixels_are_kept(run):
     for image in rendered("dolly").images:
         s.push(image)
     assert all(not isinstance(value, np.ndarray) for seen in s.frames for value in seen.__getstate__())
-    per_frame = [pixels.nbytes for pixels in s._pixels]
+    per_frame = [image.tracks.pixels.nbytes for image in s._mapper.images]
     assert max(per_frame) <= 250 * 16
 
 
