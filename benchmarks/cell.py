@@ -152,9 +152,9 @@ def _factorsfm(cell: Cell, shot: Shot, folders: Folders) -> Estimate:
                 images.add(frame)
             result, given = images.finish(), None
     else:
-        stream = Stream(shot.camera, depth=depth, masks=masks, options=options)
-        given = pose_arrays([stream.push(frame).cam_from_world for frame in frames])
-        result = stream.finish()
+        with Stream(shot.camera, depth=depth, masks=masks, options=options) as stream:
+            given = pose_arrays([stream.push(frame).cam_from_world for frame in frames])
+            result = stream.finish()
     with tempfile.TemporaryDirectory(prefix="result-") as folder:
         start = time.perf_counter()
         result.write(Path(folder) / "result")

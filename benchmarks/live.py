@@ -56,25 +56,23 @@ class Measured:
 
 def measure(shot: Shot, data: Path, models: Path, cache: Path) -> Measured:
     """Stream a shot with TCMonoDepth, then polish it."""
-    stream = Stream(
-        shot.camera,
-        depth=open_prior("tcmonodepth", shot, data, models, cache),
-        masks=MaskFolder(shot.masks) if shot.masks is not None else None,
-    )
+    depth = open_prior("tcmonodepth", shot, data, models, cache)
+    masks = MaskFolder(shot.masks) if shot.masks is not None else None
     updates: list[FrameUpdate] = []
     latency = []
-    begin = time.perf_counter()
-    with open_source(shot.frames()) as source:
-        for frame in source:
-            start = time.perf_counter()
-            updates.append(stream.push(frame))
-            latency.append(time.perf_counter() - start)
-    seconds = time.perf_counter() - begin
-    poses = {
-        "as given": [update.cam_from_world for update in updates],
-        "graph": stream.trajectory(),
-        "polished": [frame.cam_from_world for frame in stream.finish().frames],
-    }
+    with Stream(shot.camera, depth=depth, masks=masks) as stream:
+        begin = time.perf_counter()
+        with open_source(shot.frames()) as source:
+            for frame in source:
+                start = time.perf_counter()
+                updates.append(stream.push(frame))
+                latency.append(time.perf_counter() - start)
+        seconds = time.perf_counter() - begin
+        poses = {
+            "as given": [update.cam_from_world for update in updates],
+            "graph": stream.trajectory(),
+            "polished": [frame.cam_from_world for frame in stream.finish().frames],
+        }
     errors = {}
     for name, trajectory in poses.items():
         e = trajectory_errors(*pose_arrays(trajectory), shot.rotations, shot.centers)
@@ -170,23 +168,22 @@ def shot_table(runs: Sequence[Measured]) -> str:
 def long_stream(count: int) -> str:
     """A rendered move back and forth, again and again: cost per frame, memory, and drift."""
     shot = render_shot("truck", 60, 960, 540)
-    stream = Stream(shot.camera)
     latency: list[float] = []
     memory: dict[int, float] = {}
     updates = []
-    for k, frame in enumerate(islice(_back_and_forth(shot), count)):
-        start = time.perf_counter()
-        updates.append(stream.push(frame))
-        latency.append(time.perf_counter() - start)
-        if k in (_WARM_UP, count - 1):
-            memory[k] = resident_mb()
+    with Stream(shot.camera) as stream:
+        for k, frame in enumerate(islice(_back_and_forth(shot), count)):
+            start = time.perf_counter()
+            updates.append(stream.push(frame))
+            latency.append(time.perf_counter() - start)
+            if k in (_WARM_UP, count - 1):
+                memory[k] = resident_mb()
     early, late = np.mean(latency[200:700]), np.mean(latency[-500:])
     order = [k for k, _ in zip(_turns(len(shot.images)), range(count), strict=False)]
     truth = [shot.cam_from_world[k] for k in order]
     errors = trajectory_errors(*pose_arrays([update.cam_from_world for update in updates]), *pose_arrays(truth))
     path = float(np.linalg.norm(np.ptp(pose_arrays(truth)[1], axis=0)))
     halves = np.nanmedian(errors.ate[200:700]), np.nanmedian(errors.ate[-500:])
-    stream.close()
     rows: list[list[object]] = [
         ["frames", count],
         ["registered", sum(update.cam_from_world is not None for update in updates)],

@@ -76,9 +76,9 @@ def solve(job: Job, data: Path, models: Path) -> Arrays:
     given: list[Any] = []
     if job.live:
         prior, ignored = factorsfm.DepthModel(depth), MaskFolder(masks) if masks else None
-        stream = Stream(factorsfm.read_camera(camera), depth=prior, masks=ignored)
-        given = [stream.push(frame) for frame in factorsfm.read_frames(source)]
-        result = stream.finish()
+        with Stream(factorsfm.read_camera(camera), depth=prior, masks=ignored) as stream:
+            given = [stream.push(frame) for frame in factorsfm.read_frames(source)]
+            result = stream.finish()
     else:
         result = factorsfm.reconstruct(source, camera=camera, depth=depth, masks=masks, **dict(job.options))
     return {

@@ -128,15 +128,15 @@ def _from_shot(
     control: Control | None,
     progress: Progress | None,
 ) -> Reconstruction:
-    stream = Stream(camera, depth=depth, masks=masks, options=options, control=control)
-    for done, frame in enumerate(read_frames(source, frames)):
-        if progress is not None:
-            progress("frames", done, None)
-        stream.push(frame)
-    if not stream.frames:
-        raise InputError(f"no frames in {source}")
-    check_matched(source, depth, masks)
-    return stream.finish(progress)
+    with Stream(camera, depth=depth, masks=masks, options=options, control=control) as stream:
+        for done, frame in enumerate(read_frames(source, frames)):
+            if progress is not None:
+                progress("frames", done, None)
+            stream.push(frame)
+        if not stream.frames:
+            raise InputError(f"no frames in {source}")
+        check_matched(source, depth, masks)
+        return stream.finish(progress)
 
 
 def _from_images(

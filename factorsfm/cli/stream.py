@@ -8,8 +8,8 @@ import math
 import signal
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType
@@ -102,9 +102,9 @@ def run(arguments: argparse.Namespace, progress: Progress, show: Show) -> str:
     options = replace(Options.preset_named(arguments.preset), lens=arguments.lens, shutter=arguments.shutter)
     depth = open_depth(unless_none(arguments.depth), arguments.depth_kind) if options.uses_depth else None
     masks = open_masks(unless_none(arguments.masks))
-    with open_viewer(arguments.viewer, arguments.record) as viewer:
+    with open_viewer(arguments.viewer, arguments.record) as viewer, ExitStack() as held:
         watched = viewer.watch(depth)
-        resumed = _resumed(arguments, watched, masks) if arguments.resume else None
+        resumed = held.enter_context(_resumed(arguments, watched, masks)) if arguments.resume else None
         with open_source(
             arguments.source,
             frames=frames,
@@ -127,6 +127,7 @@ def run(arguments: argparse.Namespace, progress: Progress, show: Show) -> str:
                             if arguments.cuts
                             else Stream(camera, **given)
                         )
+                        held.callback(target.close)
                     start = time.perf_counter()
                     update = target.push(frame)
                     line.tell(update, time.perf_counter() - start)
@@ -139,10 +140,10 @@ def run(arguments: argparse.Namespace, progress: Progress, show: Show) -> str:
         if isinstance(target, Stream) and arguments.snapshot:
             _save(target, arguments.snapshot)
         check_matched(arguments.source, depth, masks)
-        with target:
-            if isinstance(target, Episode):
-                return end.conclude(target.finish(progress))
-            return end.write(target, viewer, progress)
+        if isinstance(target, Episode):
+            target.finish(progress)
+            return end.conclude()
+        return end.write(target, viewer, progress)
 
 
 def unless_none(text: str | None) -> str | None:
@@ -178,6 +179,7 @@ class _End:
         self._source = source
         self._begin = begin
         self._said: list[str] = []  # of the shots of a film
+        self._reconstructed = 0  # of these
         self._given = {k: v for k, v in vars(arguments).items() if k not in ("command", "output", "verbose")}
         if "://" in arguments.source:  # it may hold a password
             self._given["source"] = source.name
@@ -200,13 +202,14 @@ class _End:
             write_failure(folder, shot.reason, shot.frames, self._given, self._seconds())
         else:
             write_folder(self._completed(shot.reconstruction), folder)
+            self._reconstructed += 1
         said = verdict(shot.reconstruction) if shot.reconstruction else f"not reconstructed: {shot.reason}"
         self._said.append(f"{folder.name}, frames {shot.first} to {shot.last}: {said}.")
 
-    def conclude(self, shots: Sequence[ShotResult]) -> str:
+    def conclude(self) -> str:
         """What to say of the shots of a film, all of which have been written."""
-        if not any(shot.reconstruction for shot in shots):
-            raise ReconstructionError(f"none of {len(shots)} shots could be reconstructed; {self._said[0]}")
+        if not self._reconstructed:
+            raise ReconstructionError(f"none of {len(self._said)} shots could be reconstructed; {self._said[0]}")
         return "\n".join([*self._said, f"Results in {self._output}"])
 
     def _completed(self, reconstruction: Reconstruction) -> Reconstruction:
@@ -273,16 +276,18 @@ def _check(arguments: argparse.Namespace) -> None:
 
 
 def _resumed(arguments: argparse.Namespace, depth: DepthPrior | None, masks: MaskPrior | None) -> Stream:
-    stream = Stream.load(arguments.resume, depth=depth, masks=masks)
-    if stream.options.preset != arguments.preset:
-        raise InputError(
-            f"snapshot {arguments.resume} was made with --preset {stream.options.preset}, not {arguments.preset}"
-        )
-    if arguments.camera:
-        given = camera_to_json(read_camera(arguments.camera))
-        if stream.camera is not None and given != camera_to_json(stream.camera):
-            raise InputError(f"snapshot {arguments.resume} was made with another camera than {arguments.camera}")
-    return stream
+    with ExitStack() as unless_the_same:
+        stream = unless_the_same.enter_context(Stream.load(arguments.resume, depth=depth, masks=masks))
+        if stream.options.preset != arguments.preset:
+            raise InputError(
+                f"snapshot {arguments.resume} was made with --preset {stream.options.preset}, not {arguments.preset}"
+            )
+        if arguments.camera:
+            given = camera_to_json(read_camera(arguments.camera))
+            if stream.camera is not None and given != camera_to_json(stream.camera):
+                raise InputError(f"snapshot {arguments.resume} was made with another camera than {arguments.camera}")
+        unless_the_same.pop_all()
+        return stream
 
 
 def _after(source: Source, stream: Stream, name: str) -> Iterator[Frame]:

@@ -11,18 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.result.reconstruction import FrameResult
+from factorsfm.support.context import Closing
 
 _WIDTH = 384
 _QUALITY = 60  # of JPEG
 _MOST = 240  # about 4 MB
 
 
-class Thumbnails:
+class Thumbnails(Closing):
     """Small JPEGs of a stream of frames: of every frame, of a longer shot of every second, fourth, ... one.
 
     Example:
-        >>> thumbnails = Thumbnails()
-        >>> thumbnails.add(np.zeros((270, 480, 3), np.uint8))
+        >>> with Thumbnails() as thumbnails:
+        ...     thumbnails.add(np.zeros((270, 480, 3), np.uint8))
         >>> len(thumbnails.by_frame())
         1
     """
@@ -42,6 +43,10 @@ class Thumbnails:
         if len(self._kept) > self._most:
             self._step *= 2
             self._kept = {position: jpeg for position, jpeg in self._kept.items() if position % self._step == 0}
+
+    def close(self) -> None:
+        """Let the thread go once it has made all pictures; no further frame can be added."""
+        self._worker.shutdown()
 
     def by_frame(self) -> list[bytes | None]:
         """One entry per frame that was added, None where none is kept."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -48,8 +49,8 @@ class Episode(Closing):
     Args:
         camera: the lens of all shots; None guesses it for each.
         depth, masks, options: see `Stream`.
-        finished: called with each result as soon as it is there, in order of time, from a thread of its own; what it
-            raises is raised by `finish`.
+        finished: takes each result as soon as it is there, in order of time, from a thread of its own, so that a film
+            of any length needs the memory of few shots; what it raises is raised by `finish`.
 
     Example:
         >>> episode = factorsfm.Episode(depth=factorsfm.DepthModel("model.onnx"))  # doctest: +SKIP
@@ -75,7 +76,8 @@ class Episode(Closing):
         self._shot = 0
         self._pushed = 0
         self._worker = ThreadPoolExecutor(1, "factorsfm-shots")
-        self._results: list[Future[ShotResult]] = []
+        self._ended: deque[Stream] = deque()  # streams of shots that wait for the worker
+        self._results: list[Future[ShotResult | None]] = []
 
     def push(self, frame: Frame | NDArray[np.uint8]) -> FrameUpdate:
         """Take the next frame; `FrameUpdate.shot` says to which shot it belongs. Errors as in `Stream.push`."""
@@ -100,7 +102,7 @@ class Episode(Closing):
         if len(stream.frames) == _CERTAIN:
             for number in sorted(self._streams):
                 if number < self._shot:
-                    self._results.append(self._worker.submit(self._finish, self._streams.pop(number), None))
+                    self._end(number, None)
         return replace(update, shot=self._shot)
 
     @property
@@ -109,25 +111,38 @@ class Episode(Closing):
         return self._streams[self._shot]
 
     def finish(self, progress: Callable[[str, int, int | None], None] | None = None) -> list[ShotResult]:
-        """Polish what is not polished yet; all shots in order of time."""
-        self._results += [
-            self._worker.submit(self._finish, self._streams.pop(number), progress) for number in sorted(self._streams)
-        ]
-        self._worker.shutdown()
-        return [result.result() for result in self._results]
+        """Polish what is not polished yet.
+
+        Returns:
+            All shots in order of time; none where `finished` has taken them.
+        """
+        with self:
+            for number in sorted(self._streams):
+                self._end(number, progress)
+            self._worker.shutdown()
+            results = [result.result() for result in self._results]
+            return [result for result in results if result is not None]
 
     def close(self) -> None:
-        """Give up what is not finished."""
-        self._worker.shutdown(wait=False, cancel_futures=True)
-        for stream in self._streams.values():
+        """Give up what is not finished, but for a shot that is being polished: it is waited for."""
+        self._worker.shutdown(cancel_futures=True)
+        for stream in (*self._ended, *self._streams.values()):
             stream.close()
 
-    def _finish(self, stream: Stream, progress: Callable[[str, int, int | None], None] | None) -> ShotResult:
+    def _end(self, number: int, progress: Callable[[str, int, int | None], None] | None) -> None:
+        """No further frame belongs to a shot."""
+        self._ended.append(self._streams.pop(number))
+        self._results.append(self._worker.submit(self._finish, progress))
+
+    def _finish(self, progress: Callable[[str, int, int | None], None] | None) -> ShotResult | None:
+        """Polish the next shot that has ended; its result, if nobody else takes it."""
+        stream = self._ended.popleft()
         first, last = stream.frames[0].index, stream.frames[-1].index
         try:
             result = ShotResult(first, last, stream.finish(progress))
         except ReconstructionError as error:
             result = ShotResult(first, last, None, str(error), error.frames)
-        if self._finished is not None:
-            self._finished(result)
-        return result
+        if self._finished is None:
+            return result
+        self._finished(result)
+        return None

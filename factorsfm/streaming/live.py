@@ -40,13 +40,14 @@ class Live(Closing, Iterator[FrameUpdate]):
 
     def finish(self, progress: Callable[[str, int, int | None], None] | None = None) -> Reconstruction:
         """Stop reading, and polish over the frames that came; errors as in `Stream.finish`."""
-        self.source.close()
-        return self.stream.finish(progress)
+        with self:
+            self.source.close()
+            return self.stream.finish(progress)
 
     def close(self) -> None:
         """Stop reading, and give up what is not finished."""
-        self.source.close()
-        self.stream.close()
+        with self.stream:
+            self.source.close()
 
 
 def track(
@@ -79,5 +80,6 @@ def track(
     """
     options = Options.preset_named(preset)
     prior = open_depth(depth, depth_kind) if options.uses_depth else None
-    stream = Stream(open_camera(camera), depth=prior, masks=open_masks(masks), options=options)
-    return Live(open_source(source, frames=frames, raw=raw, watch=watch, drop=drop), stream)
+    lens, ignored = open_camera(camera), open_masks(masks)
+    opened = open_source(source, frames=frames, raw=raw, watch=watch, drop=drop)
+    return Live(opened, Stream(lens, depth=prior, masks=ignored, options=options))

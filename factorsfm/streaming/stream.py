@@ -7,7 +7,7 @@ import math
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any
@@ -100,11 +100,12 @@ class Stream(Closing):
         self.frames: list[SeenFrame] = []
         self._depth = depth if self.options.uses_depth else None
         self._masks = masks
-        self._tracker = FlowTracker(self.options.tracker)
+        self._held = ExitStack()
+        self._closed = False
+        self._tracker = self._held.enter_context(FlowTracker(self.options.tracker))
         self._finder = ViewFinder(self._tracker)
-        self._thumbnails = Thumbnails()
-        self._threads: OneThreadEach | None = None
-        self._graph = GraphProcess()  # it starts while the source opens
+        self._thumbnails = self._held.enter_context(Thumbnails())
+        self._graph = self._held.enter_context(GraphProcess())  # it starts while the source opens
         self._mapper: Mapper | None = None
         self._size = (0, 0)
         self._colors = TrackColors()
@@ -119,8 +120,10 @@ class Stream(Closing):
         Raises:
             InputError: it is no image, its size differs from that of the frames before or contradicts the camera, or
                 a prior fails on it (the depth prior: before there is a map, later the frame goes without); the stream
-                can go on with another frame.
+                can go on with another frame, unless it is closed.
         """
+        if self._closed:
+            raise InputError("the stream is closed and takes no further frame")
         frame = as_frame(frame, len(self.frames))
         mapper = self._mapper or self._open(frame)
         focal_changed = self._follow_focal(mapper)
@@ -214,8 +217,11 @@ class Stream(Closing):
         """
         state = read_snapshot(Path(path))
         try:
-            stream = cls(depth=depth, masks=masks, options=Options.from_dict(state["options"]))
-            stream._restore(state)
+            with ExitStack() as unless_restored:
+                stream = cls(depth=depth, masks=masks, options=Options.from_dict(state["options"]))
+                unless_restored.enter_context(stream)
+                stream._restore(state)
+                unless_restored.pop_all()
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise InputError(f"snapshot {path} does not hold the state of a stream: {error!r}") from error
         return stream
@@ -240,10 +246,10 @@ class Stream(Closing):
             InputError: the control names a frame that is not there.
             ReconstructionError: no frame could be registered, or too few points remain.
         """
-        mapper = self._mapper
-        if mapper is None or len(self.frames) < 2:
-            raise self._failure(f"frames in the shot: {len(self.frames)}, at least 2 needed")
         with self:
+            mapper = self._mapper
+            if mapper is None or len(self.frames) < 2:
+                raise self._failure(f"frames in the shot: {len(self.frames)}, at least 2 needed")
             try:
                 return self._polished(mapper, progress)
             except ReconstructionError as error:
@@ -308,10 +314,9 @@ class Stream(Closing):
         return locate(self.control, self.frames, lambda position, xy: normalized_from_pixels(self.camera, xy))
 
     def close(self) -> None:
-        """Give up without a result; `finish` closes, too."""
-        self._graph.close()
-        if self._threads is not None:
-            self._threads.close()
+        """End all threads and processes of the stream, with a result or without; `finish` closes, too."""
+        self._closed = True
+        self._held.close()
 
     def _forget(self, mapper: Mapper, ids: NDArray[np.int64]) -> None:
         """Tracks are left out of the images before the newest, which the graph may be working on."""
@@ -345,7 +350,7 @@ class Stream(Closing):
 
     def _new_mapper(self) -> Mapper:
         assert self.camera is not None
-        self._threads = OneThreadEach()
+        self._held.enter_context(OneThreadEach())
         focal = 0.5 * (self.camera.focal_length_x + self.camera.focal_length_y)
         return Mapper(self._graph, focal, self._size[0], self.options, has_prior=self._depth is not None)
 

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.support.context import Closing
 from factorsfm.support.options import TrackerOptions
 from factorsfm.tracks.grey import GreyFrame, exposed_as
 from factorsfm.tracks.local_motion import LocalMotion
@@ -57,7 +58,7 @@ class TrackedFrame:
     texture: float
 
 
-class FlowTracker:
+class FlowTracker(Closing):
     """Follows image points through a video, one frame at a time, in bounded memory."""
 
     def __init__(self, options: TrackerOptions) -> None:
@@ -109,6 +110,10 @@ class FlowTracker:
         self._frame += 1
         self._patches.warp_ahead(self._pool)
         return TrackedFrame(self._ids.copy(), self._xy.astype(np.float64), lost, born, texture)
+
+    def close(self) -> None:
+        """Let the threads go; no further image can be tracked."""
+        self._pool.shutdown()
 
     def avoid(self, ids: NDArray[np.int64]) -> None:
         """End tracks of what is laid over the images, and start none in these places again."""

@@ -1,6 +1,8 @@
 """A film of several shots: each its own reconstruction."""
 
+import gc
 import threading
+import weakref
 
 import cv2
 import numpy as np
@@ -37,22 +39,25 @@ def test_a_hard_cut_gives_two_reconstructions():
     assert first.reconstruction.kind is ShotKind.GENERAL
 
 
-def test_each_result_is_told_as_soon_as_it_is_there():
-    told: list[ShotResult] = []
+def test_each_result_is_handed_out_as_soon_as_it_is_there_and_not_kept():
+    told: list[tuple[int, int]] = []
+    kept: list[weakref.ref[np.ndarray]] = []
     there = threading.Event()
 
     def take(shot: ShotResult) -> None:
-        told.append(shot)
+        told.append((shot.first, len(shot.reconstruction.registered)))
+        kept.append(weakref.ref(shot.reconstruction.points))
         there.set()
 
     episode = Episode(rendered("dolly").camera, options=OPTIONS, finished=take)
     for image in [*rendered("dolly").images, *other()]:
         episode.push(image)
     assert there.wait(60)
-    assert [shot.first for shot in told] == [0]  # before the end of the film
-    shots = episode.finish()
-    assert len(shots) == 2
-    assert all(shot is its for shot, its in zip(shots, told, strict=True))
+    assert told == [(0, FRAMES)]  # before the end of the film
+    assert episode.finish() == []
+    assert told == [(0, FRAMES), (FRAMES, FRAMES)]
+    gc.collect()
+    assert [reference() for reference in kept] == [None, None]
 
 
 def test_what_a_listener_raises_comes_out_at_the_end():
