@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import base64
-import json
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from html import escape
@@ -14,20 +12,16 @@ from string import Template
 from typing import Any
 from urllib.parse import quote
 
-import cv2
-import numpy as np
-
+from factorsfm.batch.outcome import read_outcome, thumbnail
 from factorsfm.batch.plan import Job, Video
+from factorsfm.export.writing import complete_file
 from factorsfm.report.document import document, packaged
 from factorsfm.report.result_folder import check_directory
 from factorsfm.report.wording import grade_of
 from factorsfm.support.errors import InputError
+from factorsfm.support.json_reading import read_json, typed
 from factorsfm.support.json_text import json_text
 from factorsfm.support.program import PROGRAM, program_version
-
-_THUMBNAIL_WIDTH = 240
-_QUALITY = 70  # of JPEG
-_DATA = re.compile(r'<script type="application/json" id="data">(.*?)</script>', re.DOTALL)
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,21 +53,20 @@ class Entry:
     @staticmethod
     def of(job: Job, output: Path) -> Entry:
         """Read the result of a job that is done."""
-        summary = json.loads((job.folder / "summary.json").read_text(encoding="utf-8"))
-        done = summary["reconstructed"]
-        error = _number(summary.get("reprojection_error"))
+        outcome = read_outcome(job.folder)
+        done = outcome.reconstructed
         return Entry(
             video=job.video.path.name,
             shot=int(job.folder.name.rpartition("_")[2]),
             folder=job.folder.relative_to(output.absolute()).as_posix(),
             frames=(job.frames.start, job.frames.stop),
             reconstructed=done,
-            grade=grade_of(summary["registered"], summary["frames"], error) if done else "Not solved",
-            verdict=summary["verdict"] if done else summary["reason"].rstrip("."),
-            registered=summary["registered"] if done else 0,
-            parallax=_number(summary.get("parallax")),
-            seconds=summary["seconds"]["total"],
-            thumbnail=_thumbnail(job.folder / "report.html"),
+            grade=grade_of(outcome.registered, outcome.frames, outcome.reprojection_error) if done else "Not solved",
+            verdict=outcome.verdict if done else outcome.reason.rstrip("."),
+            registered=outcome.registered if done else 0,
+            parallax=outcome.parallax,
+            seconds=outcome.seconds.get("total", math.nan),
+            thumbnail=thumbnail(job.folder / "report.html"),
         )
 
 
@@ -114,12 +107,8 @@ class Index:
             InputError: they cannot be written.
         """
         for name, text in (("index.json", json_text(self._to_dict())), ("index.html", self._html())):
-            try:
-                self._output.mkdir(parents=True, exist_ok=True)
-                (self._output / f".{name}").write_text(text, encoding="utf-8")
-                (self._output / f".{name}").replace(self._output / name)
-            except OSError as error:
-                raise InputError(f"cannot write {self._output / name}: {error.strerror or error}") from error
+            with complete_file(self._output / name) as file:
+                file.write_text(text, encoding="utf-8")
 
     def _to_dict(self) -> dict[str, Any]:
         return {
@@ -172,6 +161,29 @@ class Index:
         return f'<section><h2>{escape(video.path.name)}</h2>{reason}<ol class="shots">{rows}</ol></section>'
 
 
+@dataclass(frozen=True, slots=True)
+class _EarlierVideo:
+    """A video in index.json, see `Video.to_dict`, and the first frame of each shot and the one after its last."""
+
+    video: str
+    size: int
+    modified_ns: int
+    shots: list[list[int]]
+
+    def key(self) -> str:
+        return json_text({"video": self.video, "size": self.size, "modified_ns": self.modified_ns})
+
+
+@dataclass(frozen=True, slots=True)
+class _Earlier:
+    """What index.json says of the run that has written it."""
+
+    program: str
+    version: str
+    source: str
+    videos: list[_EarlierVideo]
+
+
 def shots_known(output: Path, source: Path) -> dict[str, list[range]]:
     """Shots that an earlier run has found, by the JSON text of `Video.to_dict`; empty if another version did.
 
@@ -183,17 +195,15 @@ def shots_known(output: Path, source: Path) -> dict[str, list[range]]:
         check_directory(output)
         return {}
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        if content["program"] != PROGRAM:
-            raise ValueError(content["program"])
-        if (earlier := content["source"]) != str(source.absolute()):
-            raise InputError(f"{output} holds the shots of {earlier}, not of {source}; choose a new or empty folder")
-        if content["version"] != program_version():
-            return {}
-        found = [([range(*pair) for pair in video.pop("shots")], video) for video in content["videos"]]
-        return {json_text(video): shots for shots, video in found}
-    except (OSError, ValueError, LookupError, TypeError) as error:
+        earlier = typed(_Earlier, read_json(path, "the index"), "index.json")
+        if earlier.program != PROGRAM:
+            raise InputError(f"{path} is of {earlier.program}")
+        known = {video.key(): [range(first, stop) for first, stop in video.shots] for video in earlier.videos}
+    except (InputError, ValueError) as error:
         raise InputError(f"{path} is not that of an earlier batch; choose a new or empty folder") from error
+    if earlier.source != str(source.absolute()):
+        raise InputError(f"{output} holds the shots of {earlier.source}, not of {source}; choose a new or empty folder")
+    return known if earlier.version == program_version() else {}
 
 
 def _verdict(totals: Mapping[str, Any]) -> str:
@@ -232,25 +242,3 @@ def _duration(seconds: float) -> str:
         return f"{seconds:.1f} s"
     minutes, hours = seconds / 60, seconds / 3600
     return f"{minutes:.0f} min" if minutes < 100 else f"{hours:.1f} h"
-
-
-def _number(value: float | None) -> float:
-    """JSON has no NaN."""
-    return math.nan if value is None else value
-
-
-def _thumbnail(report: Path) -> bytes | None:
-    """The picture in the middle of a report, smaller."""
-    match = _DATA.search(report.read_text(encoding="utf-8"))
-    pictures = [text for text in json.loads(match[1])["thumbnail"] if text] if match else []
-    if not pictures:
-        return None
-    image = cv2.imdecode(np.frombuffer(base64.b64decode(pictures[len(pictures) // 2]), np.uint8), cv2.IMREAD_COLOR)
-    if image is None:
-        return None
-    height, width = image.shape[:2]
-    size = (_THUMBNAIL_WIDTH, max(1, round(height * _THUMBNAIL_WIDTH / width)))
-    _, jpeg = cv2.imencode(
-        ".jpg", cv2.resize(image, size, interpolation=cv2.INTER_AREA), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
-    )
-    return jpeg.tobytes()

@@ -11,6 +11,7 @@ from typing import Any
 
 import pycolmap
 
+from factorsfm.batch.outcome import is_result_of
 from factorsfm.camera.files import camera_to_json
 from factorsfm.frames.cuts import find_shots
 from factorsfm.frames.folders import list_files
@@ -102,11 +103,7 @@ class Job:
 
     def is_done(self) -> bool:
         """Whether the folder holds the result of this very job."""
-        try:
-            content = json.loads((self.folder / "summary.json").read_text(encoding="utf-8"))
-            return (self.folder / "report.html").is_file() and content["options"]["job"] == self.to_dict()
-        except (OSError, ValueError, LookupError, TypeError):
-            return False
+        return is_result_of(self.to_dict(), self.folder)
 
 
 def find_videos(source: Path) -> list[Video]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from factorsfm.camera.projection import PIXEL_CENTER
 from factorsfm.support.errors import InputError
+from factorsfm.support.json_reading import read_json
 
 # Smallest and largest focal length over the longer image side; one outside has the wrong unit, such as millimetres.
 # A 2,000 mm lens on Super 35 film has a ratio of 80.
@@ -31,12 +31,7 @@ def read_camera(path: str | Path) -> pycolmap.Camera:
         InputError: the file cannot be read or is not JSON, a key is missing, or a value is out of range.
     """
     path = Path(path)
-    try:
-        content = json.loads(path.read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise InputError(f"camera file {path} cannot be read: {error.strerror}") from error
-    except ValueError as error:
-        raise InputError(f"camera file {path} is not JSON: {error}") from error
+    content = read_json(path, "camera file")
     if not isinstance(content, dict):
         raise InputError(f"camera file {path} holds a {type(content).__name__}; a JSON object is expected")
     try:

@@ -6,7 +6,6 @@ with its standard deviation (`sigma`). Frames are named by their name, with or w
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -20,6 +19,7 @@ from numpy.typing import NDArray
 from factorsfm.adjustment.observations import Observations
 from factorsfm.control.world_alignment import check_enough
 from factorsfm.support.errors import InputError
+from factorsfm.support.json_reading import read_json
 
 Array = NDArray[np.float64]
 Vector = Sequence[float] | Array
@@ -288,12 +288,7 @@ def read_control(path: str | Path) -> Control:
         InputError: not readable, not JSON, an unknown key, or a value that is none.
     """
     path = Path(path)
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"control file {path} cannot be read: {error.strerror}") from error
-    except ValueError as error:
-        raise InputError(f"control file {path} is not JSON: {error}") from error
+    content = read_json(path, "control file")
     try:
         if not isinstance(content, dict) or not set(content) <= set(_KINDS):
             given = ", ".join(content) if isinstance(content, dict) else type(content).__name__

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -29,7 +30,8 @@ def complete_file(path: Path) -> Iterator[Path]:
 def complete_folder(path: Path) -> Iterator[Path]:
     """A folder to write into; it takes its place when the block ends without an error.
 
-    A folder that exists is accepted if it holds nothing but files of the same names: an earlier export.
+    A folder that exists is accepted if it holds nothing but files of the same names: an earlier export. Its entries are
+    replaced one by one, since it may be a mount point or the working directory.
 
     Raises:
         InputError: it cannot be written, or it holds something else.
@@ -42,22 +44,38 @@ def complete_folder(path: Path) -> Iterator[Path]:
         folder.mkdir()
         yield folder
         if path.exists():
-            _replace_content(path, folder)
+            _replace_content(path, folder, temporary / "replaced")
         else:
             folder.rename(path)
 
 
-def _replace_content(path: Path, new: Path) -> None:
-    entries = {entry.relative_to(new): entry for entry in sorted(new.rglob("*"))}
+def rename_all(moves: Iterable[tuple[Path, Path]]) -> None:
+    """Rename one after the other, (from, to); an error takes everything back."""
+    done: list[tuple[Path, Path]] = []
+    try:
+        for source, target in moves:
+            done.append((source, target))
+            source.replace(target)
+    except BaseException:
+        for source, target in reversed(done):
+            if not os.path.lexists(source):
+                target.replace(source)
+        raise
+
+
+def exchanged(directory: Path, new: Path, replaced: Path, names: Iterable[str]) -> list[tuple[Path, Path]]:
+    """The renames that put the entries of `new` into `directory`, and what has their names there into `replaced`."""
+    moves = [((directory / name, replaced / name), (new / name, directory / name)) for name in names]
+    return [move for pair in moves for move in pair if os.path.lexists(move[0])]
+
+
+def _replace_content(path: Path, new: Path, replaced: Path) -> None:
+    entries = {entry.relative_to(new) for entry in new.rglob("*")}
     present = [entry for entry in path.rglob("*") if entry not in new.parents and not entry.is_relative_to(new)]
-    others = {entry.relative_to(path) for entry in present} - set(entries)
-    if others:
+    if others := {entry.relative_to(path) for entry in present} - entries:
         raise InputError(f"the output folder {path} holds something else ({min(others)}); choose a new folder")
-    for name, entry in entries.items():
-        if entry.is_dir():
-            (path / name).mkdir(exist_ok=True)
-        else:
-            entry.replace(path / name)
+    replaced.mkdir()
+    rename_all(exchanged(path, new, replaced, sorted(entry.name for entry in new.iterdir())))
 
 
 @contextmanager

@@ -1,8 +1,7 @@
-"""The result folder: written beside its place and moved there when it is complete."""
+"""The result folder: written beside its place, and moved there when it is complete."""
 
 from __future__ import annotations
 
-import json
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,22 +12,28 @@ from typing import Any
 from factorsfm.export.colmap import write_colmap
 from factorsfm.export.ply import write_ply
 from factorsfm.export.trajectory import write_trajectory
+from factorsfm.export.writing import exchanged, rename_all
 from factorsfm.report.page import failure_html, report_html
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
-from factorsfm.result.summary import failure_summary, part_name, summary
+from factorsfm.result.summary import failure_summary, incomplete_summary, part_name, summary
 from factorsfm.support.errors import InputError
+from factorsfm.support.json_reading import read_json
 from factorsfm.support.json_text import json_text
 from factorsfm.support.program import PROGRAM
 
-# Whatever an earlier result may have left; picture.png is drawn by the demo.
-_ENTRIES = ("trajectory.tum", "colmap", "points.ply", "report.html", "picture.png", "summary.json")
+# Whatever an earlier result may have left besides summary.json; picture.png is drawn by the demo.
+_ENTRIES = ("trajectory.tum", "colmap", "points.ply", "report.html", "picture.png")
+_SUMMARY = "summary.json"
+_PARTS = "part-[0-9][0-9][0-9]*"  # folders of the other parts of an image set
+_REPLACING = f".{PROGRAM}-replacing-"  # begins the name of the folder in which a result waits that replaces another
 
 
 def write_folder(reconstruction: Reconstruction, directory: str | Path) -> None:
     """Write trajectory.tum, colmap/, points.ply, summary.json and report.html; all of them or nothing.
 
-    Other parts of an image set become folders in it, part-002 and so on. The files of an earlier result are replaced;
-    other files in such a folder stay.
+    Other parts of an image set become folders in it, part-002 and so on. The files of an earlier result are replaced
+    one by one, and other files in such a folder stay; a result that is incomplete, because the program was killed
+    meanwhile, says so and can be replaced.
 
     Raises:
         InputError: the directory cannot be written, or holds something else than an earlier result.
@@ -45,7 +50,7 @@ def _write_files(reconstruction: Reconstruction, folder: Path) -> None:
     write_colmap(reconstruction, folder / "colmap")
     write_ply(reconstruction, folder / "points.ply")
     (folder / "report.html").write_text(report_html(reconstruction), encoding="utf-8")
-    (folder / "summary.json").write_text(json_text(summary(reconstruction)), encoding="utf-8")
+    (folder / _SUMMARY).write_text(json_text(summary(reconstruction)), encoding="utf-8")
 
 
 def write_failure(
@@ -64,7 +69,7 @@ def write_failure(
         options, seconds = options or {}, seconds or {}
         (folder / "report.html").write_text(failure_html(reason, frames, options, seconds), encoding="utf-8")
         content = failure_summary(reason, frames, options, seconds)
-        (folder / "summary.json").write_text(json_text(content), encoding="utf-8")
+        (folder / _SUMMARY).write_text(json_text(content), encoding="utf-8")
 
 
 def check_directory(directory: str | Path) -> None:
@@ -75,10 +80,15 @@ def check_directory(directory: str | Path) -> None:
     """
     directory = Path(directory)
     try:
-        if directory.exists() and any(directory.iterdir()) and not is_earlier_result(directory):
+        if directory.exists() and not (_is_empty(directory) or is_earlier_result(directory)):
             raise InputError(
                 f"the output folder {directory} is not empty and holds no earlier factorsfm result; "
                 "choose a new or empty folder"
+            )
+        if foreign := {path.name for path in directory.glob(_PARTS)} - {*_parts(directory)}:
+            raise InputError(
+                f"the output folder {directory} holds {min(foreign)}, which is no part of an earlier result; "
+                "choose another folder"
             )
         existing = next(p for p in (directory, *directory.absolute().parents) if p.exists())
         with tempfile.TemporaryDirectory(prefix=f".{PROGRAM}-", dir=existing):
@@ -92,40 +102,63 @@ def _complete_or_nothing(directory: Path) -> Iterator[Path]:
     """A folder to write into; its content becomes `directory` when the block ends without an error."""
     check_directory(directory)
     existed = directory.exists()
+    # Inside a directory that exists, since that may be a mount point or the working directory.
+    place, prefix = (directory, _REPLACING) if existed else (directory.absolute().parent, f".{PROGRAM}-")
     try:
-        # Inside a directory that exists, since that may be a mount point or the working directory.
-        place = directory if existed else directory.absolute().parent
         place.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{PROGRAM}-", dir=place) as temporary:
+        with tempfile.TemporaryDirectory(prefix=prefix, dir=place) as temporary:
             folder = Path(temporary) / "result"  # a plain mkdir honours the umask, mkdtemp does not
             folder.mkdir()
             yield folder
             if existed:
-                _replace_entries(folder, directory)
+                _replace_entries(directory, folder, Path(temporary) / "replaced")
             else:
                 folder.rename(directory)
+        if existed:
+            for left in directory.glob(f"{_REPLACING}*"):  # by a program that was killed
+                shutil.rmtree(left, ignore_errors=True)
     except OSError as error:
         raise _unwritable(directory, error) from error
 
 
-def _replace_entries(new: Path, directory: Path) -> None:
-    """Swap the files one by one; summary.json, which marks a result, goes last."""
-    parts = {path.name for folder in (directory, new) for path in folder.glob("part-*") if is_earlier_result(path)}
-    for name in (*sorted(parts), *_ENTRIES):
-        old = directory / name
-        if old.is_dir():
-            shutil.rmtree(old)
-        elif not (new / name).exists():
-            old.unlink(missing_ok=True)
-        if (new / name).exists():
-            (new / name).replace(old)
+def _replace_entries(directory: Path, new: Path, replaced: Path) -> None:
+    """Exchange the entries of a result one by one; an error takes everything back.
+
+    Meanwhile summary.json says that the result is incomplete, and goes on saying so where the program is killed.
+    """
+    summary, before = directory / _SUMMARY, replaced / _SUMMARY
+    names = {*_ENTRIES, *_parts(directory), *(path.name for path in new.iterdir())} - {_SUMMARY}
+    replaced.mkdir()
+    if summary.exists():
+        shutil.copyfile(summary, before)
+    marker = replaced / "incomplete.json"
+    marker.write_text(json_text(incomplete_summary()), encoding="utf-8")
+    try:
+        marker.replace(summary)
+        rename_all([*exchanged(directory, new, replaced, sorted(names)), (new / _SUMMARY, summary)])
+    except BaseException:
+        if before.exists():
+            before.replace(summary)
+        else:
+            summary.unlink(missing_ok=True)
+        raise
+
+
+def _parts(directory: Path) -> list[str]:
+    """Names of the folders that other parts of an image set have in that of an earlier result."""
+    return [path.name for path in directory.glob(_PARTS) if is_earlier_result(path)]
+
+
+def _is_empty(directory: Path) -> bool:
+    """But for what a program has left that was killed."""
+    return all(path.name.startswith(_REPLACING) for path in directory.iterdir())
 
 
 def is_earlier_result(directory: Path) -> bool:
-    """Whether a folder holds a result, or the reason why there is none."""
+    """Whether a folder holds a result, also an incomplete one, or the reason why there is none."""
     try:
-        content = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        content = read_json(directory / _SUMMARY, "the summary")
+    except InputError:
         return False
     return isinstance(content, dict) and content.get("program") == PROGRAM
 

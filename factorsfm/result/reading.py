@@ -92,6 +92,8 @@ def _content(directory: Path) -> dict[str, Any]:
     content = read_json(directory / "summary.json", "the summary")
     if not isinstance(content, dict) or content.get("program") != PROGRAM:
         raise InputError(f"{directory} holds no result of factorsfm reconstruct: its summary.json is not factorsfm's")
+    if content.get("incomplete"):
+        raise InputError(f"the result in {directory} is incomplete: {content.get('reason')}")
     if not content.get("reconstructed"):
         raise InputError(f"the shot in {directory} could not be reconstructed: {content.get('reason')}")
     return content

@@ -66,6 +66,12 @@ def failure_summary(
     }
 
 
+def incomplete_summary() -> dict[str, Any]:
+    """The summary of a folder in which one result is being replaced by another."""
+    reason = "the program was stopped while it replaced an earlier result"
+    return {**failure_summary(reason, (), {}, {}), "incomplete": True}
+
+
 def verdict(reconstruction: Reconstruction) -> str:
     """What has been recovered, in one sentence for the user."""
     sentence = f"{registered_share(reconstruction)} registered, {len(reconstruction.points):,} points"

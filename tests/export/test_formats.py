@@ -5,6 +5,7 @@ import math
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -581,6 +582,35 @@ def test_names_with_folders_are_exported_with_them(tmp_path: Path) -> None:
     assert sorted(str(path.relative_to(images)) for path in images.rglob("*.png")) == expected
     for format in ("colmap", "colmap-binary"):
         assert sorted(i.name for i in pycolmap.Reconstruction(tmp_path / format).images.values()) == expected
+
+
+def test_an_error_while_an_export_is_replaced_leaves_the_earlier_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = ExportOptions(footage=noise_images(tmp_path / "shot", 21))
+    out, rename, renames = tmp_path / "out", Path.replace, []
+    export(hard_reconstruction(), out, format="nerfstudio", options=options)
+    before = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
+
+    def failing_after(most: int) -> Callable[[Path, Path], Path]:
+        renames.clear()
+
+        def renamed(source: Path, target: Path) -> Path:
+            renames.append(target)
+            if len(renames) == most + 1:
+                raise OSError(5, "Input/output error")
+            return rename(source, target)
+
+        return renamed
+
+    for most in range(6):  # transforms.json, points.ply and images/, each out and in
+        monkeypatch.setattr(Path, "replace", failing_after(most))
+        with pytest.raises(InputError, match="Input/output error"):
+            export(hard_reconstruction(), out, format="nerfstudio", options=options)
+        assert {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()} == before
+    monkeypatch.setattr(Path, "replace", failing_after(6))
+    export(hard_reconstruction(), out, format="nerfstudio", options=options)
+    assert len(renames) == 6
 
 
 def test_output_that_holds_something_else_is_left_alone(tmp_path: Path) -> None:

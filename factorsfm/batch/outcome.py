@@ -1,0 +1,72 @@
+"""What a batch reads back of its results: the summaries, and a picture of each report."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from factorsfm.support.errors import InputError
+from factorsfm.support.json_reading import read_json, typed
+
+_THUMBNAIL_WIDTH = 240
+_QUALITY = 70  # of JPEG
+_DATA = re.compile(r'<script type="application/json" id="data">(.*?)</script>', re.DOTALL)
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What the summary of a shot says: `verdict` where it is reconstructed, else `reason`."""
+
+    reconstructed: bool
+    frames: int
+    registered: int
+    seconds: dict[str, float]
+    verdict: str = ""
+    reason: str = ""
+    parallax: float = math.nan
+    reprojection_error: float = math.nan
+    options: dict[str, Any] = field(default_factory=dict)
+
+
+def read_outcome(folder: Path) -> Outcome:
+    """What has become of the shot with this result folder.
+
+    Raises:
+        InputError: there is no summary, or a damaged one.
+    """
+    return typed(Outcome, read_json(folder / "summary.json", "the summary"), "summary.json")
+
+
+def is_result_of(job: dict[str, Any], folder: Path) -> bool:
+    """Whether a folder holds the whole result of a job, which `Job.to_dict` describes."""
+    try:
+        return read_outcome(folder).options.get("job") == job and (folder / "report.html").is_file()
+    except InputError:
+        return False
+
+
+def thumbnail(report: Path) -> bytes | None:
+    """The picture in the middle of a report as a smaller JPEG; None where there is none."""
+    try:
+        match = _DATA.search(report.read_text(encoding="utf-8"))
+        pictures = [text for text in json.loads(match[1])["thumbnail"] if text] if match else []
+        data = base64.b64decode(pictures[len(pictures) // 2]) if pictures else b""
+    except (OSError, ValueError, LookupError, TypeError):  # a damaged report costs its picture
+        return None
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+    if image is None:
+        return None
+    height, width = image.shape[:2]
+    size = (_THUMBNAIL_WIDTH, max(1, round(height * _THUMBNAIL_WIDTH / width)))
+    _, jpeg = cv2.imencode(
+        ".jpg", cv2.resize(image, size, interpolation=cv2.INTER_AREA), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
+    )
+    return jpeg.tobytes()
