@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import logging
-import time
-from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,6 +31,7 @@ from factorsfm.result.assembly import assemble
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.support.errors import InputError, ReconstructionError
 from factorsfm.support.options import Options
+from factorsfm.support.stages import StageSeconds
 from factorsfm.support.status import FrameStatus
 from factorsfm.support.threads import OneThreadEach
 from factorsfm.tracks.image_tracks import ImageTracks
@@ -90,7 +89,7 @@ class ImageSet:
             options = options.for_unknown_lens()
         self.options = _for_image_sets(options)
         self.photos: list[Photo] = []
-        self.seconds: dict[str, float] = defaultdict(float)
+        self.seconds = StageSeconds()
         self.notes: list[str] = []
         self._depth = depth if options.uses_depth else None
         self._masks = masks
@@ -106,9 +105,9 @@ class ImageSet:
             InputError: it is no image, or a mask fails on it; the set can go on with other images.
         """
         image = bgr_image(frame.image, frame.index)
-        with self._timed("masks"):
+        with self.seconds.of("masks"):
             mask = read_mask(self._masks, frame)
-        with self._timed("reading"):
+        with self.seconds.of("reading"):
             photo = self._files.keep(frame, image, mask, len(self.photos))
             self.photos.append(photo)
             if frame.path is not None:
@@ -145,7 +144,7 @@ class ImageSet:
         colors = self._look_up(used, tracks, report)
         report("mapping", 0, None)
         focal = 0.5 * (camera.focal_length_x + camera.focal_length_y)
-        with self._timed("mapping"), OneThreadEach():
+        with self.seconds.of("mapping"), OneThreadEach():
             parts = map_parts(tracks, focal, self.options)
         self._explain(parts)
         if parts[0].registered < 2:
@@ -198,7 +197,7 @@ class ImageSet:
         """Tracks of all images, in pixels of their cameras at full size."""
         cameras = [_resized(self._cameras[self.photos[k].camera], self.photos[k].size) for k in used]
         names = [self.photos[k].file for k in used]
-        with self._timed("matching"):
+        with self.seconds.of("matching"):
             matches = match_images(
                 self._database, self._files.images, names, cameras, self._files.masks, self._features
             )
@@ -228,7 +227,7 @@ class ImageSet:
             x, y = np.clip(np.rint(xy).astype(int), 0, np.array(photo.size) - 1).T
             colors[tracks[k].ids] = image[y, x][:, ::-1]
             if self._depth is not None and len(xy):
-                with self._timed("depth"):
+                with self.seconds.of("depth"):
                     frame = Frame(photo.index, image, photo.name, photo.timestamp)
                     tracks[k] = replace(tracks[k], depth=read_depth(self._depth, frame, xy))
         return colors
@@ -245,7 +244,7 @@ class ImageSet:
         options = self.options
         if self._lens_is_open and part.parallax > _WIDE_PARALLAX:
             options = replace(options, lens="all")
-        with self._timed("polish"), OneThreadEach():
+        with self.seconds.of("polish"), OneThreadEach():
             try:
                 polished = polish(
                     part.images,
@@ -360,14 +359,6 @@ class ImageSet:
                 status, reason = images[k].status, images[k].message
             frames.append(FrameResult(photo.index, photo.name, photo.timestamp, status, reason))
         return ReconstructionError(message, frames)
-
-    @contextmanager
-    def _timed(self, stage: str) -> Iterator[None]:
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[stage] += time.perf_counter() - start
 
 
 def _for_image_sets(options: Options) -> Options:

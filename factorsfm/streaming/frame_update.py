@@ -1,14 +1,29 @@
-"""What a stream says of a frame right after it was pushed."""
+"""What a stream keeps of a frame, and what it says of it right after it was pushed."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from factorsfm.frames.frame import Frame
+from factorsfm.mapping.mapped_images import MappedImage
+from factorsfm.mapping.mapper import Mapper
+from factorsfm.result.reconstruction import FrameResult
 from factorsfm.support.status import FrameStatus
+
+
+@dataclass(frozen=True, slots=True)
+class SeenFrame:
+    """What a stream keeps of a frame: never its pixels. `texture`: see `TrackedFrame`."""
+
+    index: int
+    name: str
+    timestamp: float | None
+    texture: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,3 +74,41 @@ class FrameUpdate:
     focal_changed: bool = False
     starts_anew: bool = False
     note: str = ""
+
+
+def frame_update(
+    frame: Frame, image: MappedImage, mapper: Mapper, frames: Sequence[SeenFrame], *, focal_changed: bool
+) -> FrameUpdate:
+    """What is known of the newest frame; `image` is that of the mapper, `frames` are all that came."""
+    return FrameUpdate(
+        frame.index, image.status, image.message, pose_of(image), image.keyframe, len(image.tracks.ids),
+        image.inliers, mapper.new_points, mapper.parallax, image.covariance, _newest_prior(mapper, frames),
+        frame.dropped, focal_length=mapper.focal, focal_changed=focal_changed, starts_anew=mapper.starts_anew,
+        note=mapper.note,
+    )  # fmt: skip
+
+
+def frame_results(frames: Sequence[SeenFrame], images: Sequence[MappedImage]) -> list[FrameResult]:
+    """What has become of the frames of a shot that cannot be reconstructed."""
+    return [
+        FrameResult(
+            frame.index, frame.name, frame.timestamp, image.status, image.message, pose_of(image),
+            image.keyframe, len(image.tracks.ids), image.inliers,
+        )
+        for frame, image in zip(frames, images, strict=True)
+    ]  # fmt: skip
+
+
+def pose_of(image: MappedImage) -> pycolmap.Rigid3d | None:
+    """`cam_from_world` of an image; None where it is not registered."""
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(image.rotation), image.translation) if image.registered else None
+
+
+def _newest_prior(mapper: Mapper, frames: Sequence[SeenFrame]) -> KeyframePrior | None:
+    if mapper.without_prior:
+        return None
+    for position in reversed(mapper.keyframes):
+        affine, depth = mapper.images[position].affine, mapper.images[position].tracks.depth
+        if affine is not None and depth is not None:
+            return KeyframePrior(frames[position].index, affine[0] * depth.unit, affine[1] * depth.unit)
+    return None

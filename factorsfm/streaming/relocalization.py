@@ -20,7 +20,7 @@ _VIEWS_PER_IMAGE = 8  # keyframes compared with one image; the next image is com
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class KeyframeView:
     """What a keyframe saw: its tracks and their descriptors."""
 
     ids: Index
@@ -30,14 +30,14 @@ class View:
 class Relocalizer:
     """Remembers keyframes, and names their tracks in other images."""
 
-    def __init__(self, views: Sequence[View] = (), next_view: int = 0) -> None:
+    def __init__(self, views: Sequence[KeyframeView] = (), next_view: int = 0) -> None:
         self.views = list(views)
         self.next_view = next_view  # with which the next image is compared first
 
     def remember(self, grey: NDArray[np.uint8], ids: Index, xy: NDArray[np.float64]) -> None:
         """Keep a keyframe: (h, w) image, its track ids and their positions (n, 2) in pixels."""
         kept, descriptors = _describe(grey, xy)
-        self.views.append(View(ids[kept], descriptors))
+        self.views.append(KeyframeView(ids[kept], descriptors))
 
     def find(self, grey: NDArray[np.uint8], xy: NDArray[np.float64]) -> tuple[Index, NDArray[np.intp]]:
         """Remembered tracks among the corners of an image.

@@ -21,7 +21,7 @@ from factorsfm.camera.files import camera_from_json, camera_to_json
 from factorsfm.mapping.map_update import MapUpdate
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.priors.image_depth import ImageDepth
-from factorsfm.streaming.relocalization import View
+from factorsfm.streaming.relocalization import KeyframeView
 from factorsfm.support.errors import InputError
 from factorsfm.support.status import FrameStatus
 from factorsfm.tracks.image_tracks import ImageTracks
@@ -29,7 +29,9 @@ from factorsfm.tracks.image_tracks import ImageTracks
 _MAGIC = b"factorsfm-1\n"
 _CHECKSUM_BYTES = 32
 _DTYPES = {"bool", "uint8", "int32", "int64", "uint64", "float32", "float64"}
-_TYPES: dict[str, Any] = {t.__name__: t for t in (FrameStatus, ImageDepth, ImageTracks, MappedImage, MapUpdate, View)}
+_TYPES: dict[str, Any] = {
+    t.__name__: t for t in (FrameStatus, ImageDepth, ImageTracks, MappedImage, MapUpdate, KeyframeView)
+}
 
 
 def write_snapshot(path: Path, state: Mapping[str, Any]) -> None:

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import logging
 import math
-import time
-from collections import defaultdict
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
-from dataclasses import astuple, dataclass
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import astuple
 from pathlib import Path
 from typing import Any
 
@@ -18,31 +16,28 @@ import pycolmap
 from numpy.typing import NDArray
 
 from factorsfm.camera.files import check_camera
-from factorsfm.camera.guess import first_focal_std, guess_camera
-from factorsfm.camera.projection import normalized_from_pixels
-from factorsfm.control.known import Control, LocatedControl, locate
+from factorsfm.camera.guess import guess_camera
+from factorsfm.control.known import Control
 from factorsfm.frames.frame import Frame, as_frame
 from factorsfm.frames.texture import BLANK_TEXTURE
 from factorsfm.graph.process import GraphProcess
 from factorsfm.lens.camera_model import distortion_of
-from factorsfm.lens.rolling_shutter import Recording
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.mapping.mapper import Mapper
-from factorsfm.polish.polish import polish
 from factorsfm.priors.depth import DepthPrior
-from factorsfm.priors.depth_map import DepthKind
 from factorsfm.priors.image_depth import ImageDepth
 from factorsfm.priors.masks import MaskPrior
 from factorsfm.priors.read_priors import read_depth, read_mask
 from factorsfm.report.thumbnails import Thumbnails
-from factorsfm.result.assembly import assemble
-from factorsfm.result.reconstruction import FrameResult, Reconstruction
-from factorsfm.streaming.frame_update import FrameUpdate, KeyframePrior
+from factorsfm.result.reconstruction import Reconstruction
+from factorsfm.streaming.finishing import EndedShot
+from factorsfm.streaming.frame_update import FrameUpdate, SeenFrame, frame_results, frame_update, pose_of
 from factorsfm.streaming.snapshot import read_snapshot, write_snapshot
 from factorsfm.streaming.view_finder import ViewFinder
 from factorsfm.support.context import Closing
 from factorsfm.support.errors import InputError, ModelError, ReconstructionError
 from factorsfm.support.options import Options
+from factorsfm.support.stages import StageSeconds
 from factorsfm.support.status import FrameStatus
 from factorsfm.support.threads import OneThreadEach
 from factorsfm.tracks.colors import TrackColors
@@ -53,16 +48,6 @@ logger = logging.getLogger(__name__)
 
 _STATE = ("camera", "_size", "_lens_given", "_without_depth")
 _LEAST_SIDE = 32  # pixels: room for the patches of the tracker
-
-
-@dataclass(frozen=True, slots=True)
-class SeenFrame:
-    """What is kept of a frame: never its pixels."""
-
-    index: int
-    name: str
-    timestamp: float | None
-    texture: float
 
 
 class Stream(Closing):
@@ -96,7 +81,7 @@ class Stream(Closing):
         self._lens_given = camera is not None
         self.control = control
         self.options = options or Options()
-        self.seconds: dict[str, float] = defaultdict(float)
+        self.seconds = StageSeconds()
         self.frames: list[SeenFrame] = []
         self._depth = depth if self.options.uses_depth else None
         self._masks = masks
@@ -132,18 +117,18 @@ class Stream(Closing):
                 f"frame {frame.index} is {frame.image.shape[1]}x{frame.image.shape[0]}, "
                 f"expected {self._size[0]}x{self._size[1]} as the frames before"
             )
-        with self._timed("masks"):
+        with self.seconds.of("masks"):
             mask = read_mask(self._masks, frame)
-        with self._timed("tracking"):
+        with self.seconds.of("tracking"):
             grey = np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY), np.uint8)
             tracked = self._tracker.track(grey, mask, self._finder.expected(mapper))
         self._colors.remember(frame.image, tracked.ids, tracked.xy)
-        with self._timed("mapping"):
+        with self.seconds.of("mapping"):
             mapper.advance()
         focal_changed |= self._follow_focal(mapper)
         tracks = ImageTracks(len(self.frames), tracked.ids, tracked.xy, self.camera)
         tracks = tracks.of(tracks.invertible & (tracked.texture >= BLANK_TEXTURE))  # a blank image's tracks are noise
-        with self._timed("mapping"):
+        with self.seconds.of("mapping"):
             image = mapper.add(tracks, lambda: self._read_depth(frame, tracks.pixels))
         focal_changed |= self._follow_focal(mapper)
         self.frames.append(SeenFrame(frame.index, frame.name, frame.timestamp, tracked.texture))
@@ -151,11 +136,11 @@ class Stream(Closing):
         if len(mapper.burn_ins):
             self._tracker.avoid(mapper.burn_ins)
             self._forget(mapper, mapper.burn_ins)
-        with self._timed("relocalization"):
+        with self.seconds.of("relocalization"):
             self._finder.keep_in_sight(mapper, image, grey)
         if image.status is not FrameStatus.WAITING:  # it may still take part in the start
             _mark_blank(image, tracked.texture)
-        return self._frame_update(frame, image, focal_changed)
+        return frame_update(frame, image, mapper, self.frames, focal_changed=focal_changed)
 
     def trajectory(self) -> list[pycolmap.Rigid3d | None]:
         """`cam_from_world` of every frame so far as the graph knows it now, None where a frame is not registered.
@@ -165,7 +150,7 @@ class Stream(Closing):
         if self._mapper is None:
             return []
         self._mapper.refresh()
-        return [_pose(image) for image in self._mapper.images]
+        return [pose_of(image) for image in self._mapper.images]
 
     @property
     def points(self) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
@@ -247,71 +232,37 @@ class Stream(Closing):
             ReconstructionError: no frame could be registered, or too few points remain.
         """
         with self:
-            mapper = self._mapper
-            if mapper is None or len(self.frames) < 2:
-                raise self._failure(f"frames in the shot: {len(self.frames)}, at least 2 needed")
             try:
-                return self._polished(mapper, progress)
+                result = self._ended().reconstruction(progress)
             except ReconstructionError as error:
-                raise error if error.frames else self._failure(str(error)) from error
+                frames = frame_results(self.frames, self._mapper.images if self._mapper is not None else [])
+                self._thumbnails.attach(frames)
+                raise ReconstructionError(str(error), frames) from error
+            self._thumbnails.attach(result.frames)
+            return result
 
-    def _polished(self, mapper: Mapper, progress: Callable[[str, int, int | None], None] | None) -> Reconstruction:
-        with self._timed("mapping"):
-            mapper.finish()
-        self._follow_focal(mapper)
-        control = self._located_control()
-        for image, seen in zip(mapper.images, self.frames, strict=True):
+    def _ended(self) -> EndedShot:
+        """The shot, now that no more frames come."""
+        if self._mapper is None or len(self.frames) < 2:
+            raise ReconstructionError(f"frames in the shot: {len(self.frames)}, at least 2 needed")
+        with self.seconds.of("mapping"):
+            self._mapper.finish()
+        self._follow_focal(self._mapper)
+        for image, seen in zip(self._mapper.images, self.frames, strict=True):
             _mark_blank(image, seen.texture)
-        registered = sum(image.registered for image in mapper.images)
-        if registered < 2:
-            worst = next((i for i in mapper.images if not i.registered), mapper.images[0])
-            raise self._failure(
-                f"{registered} of {len(mapper.images)} frames registered, at least 2 needed; "
-                f"frame {self.frames[worst.tracks.position].index}: {worst.message}"
-            )
-        with self._timed("polish"):
-            result = polish(
-                mapper.images,
-                mapper.points.all(),
-                np.array([mapper.focal]),
-                self.options,
-                lambda stage: progress(stage, 0, None) if progress else None,
-                distortion_of(self.camera) if self.options.estimates_lens else None,
-                control=control,
-                first_focal=(np.array([mapper.first_focal]), first_focal_std(self.camera, given=self._lens_given)),
-                recording=self._recording(),
-            )
-        reconstruction = assemble(
-            result,
-            mapper.images,
-            self.frames,
-            self._colors.table,
-            self.camera,
+        assert self.camera is not None
+        return EndedShot(
+            frames=self.frames,
+            mapper=self._mapper,
+            colors=self._colors.table,
+            camera=self.camera,
             lens_given=self._lens_given,
-            prior_given=self._depth is not None,
-            metric=self._depth is not None and self._depth.kind is DepthKind.METRIC,
-            seconds=dict(self.seconds),
-            options=self.options.to_dict(),
+            depth=self._depth,
+            without_depth=self._without_depth,
+            control=self.control,
+            options=self.options,
+            seconds=self.seconds,
         )
-        if self._without_depth:
-            count, first = len(self._without_depth), next(iter(self._without_depth.values()))
-            reconstruction.notes.append(f"Frames that went without depth because the prior failed: {count}; {first}.")
-        if mapper.without_prior:
-            reconstruction.notes.append(f"The map went on without the depth prior: {mapper.without_prior}.")
-        self._thumbnails.attach(reconstruction.frames)
-        return reconstruction
-
-    def _recording(self) -> Recording | None:
-        """What a rolling shutter is looked for in."""
-        shutter = self.options.shutter
-        if shutter == "global" or (shutter == "auto" and self.control is not None):
-            return None
-        return Recording(*self._size, np.array([frame.index for frame in self.frames]))
-
-    def _located_control(self) -> LocatedControl | None:
-        if self.control is None:
-            return None
-        return locate(self.control, self.frames, lambda position, xy: normalized_from_pixels(self.camera, xy))
 
     def close(self) -> None:
         """End all threads and processes of the stream, with a result or without; `finish` closes, too."""
@@ -354,43 +305,13 @@ class Stream(Closing):
         focal = 0.5 * (self.camera.focal_length_x + self.camera.focal_length_y)
         return Mapper(self._graph, focal, self._size[0], self.options, has_prior=self._depth is not None)
 
-    def _frame_update(self, frame: Frame, image: MappedImage, focal_changed: bool) -> FrameUpdate:
-        mapper = self._mapper
-        assert mapper is not None
-        prior = None
-        guided = [k for k in mapper.keyframes if mapper.images[k].affine and mapper.images[k].tracks.depth]
-        if guided and not mapper.without_prior:
-            keyframe = mapper.images[guided[-1]]
-            assert keyframe.affine is not None
-            assert keyframe.tracks.depth is not None
-            unit = keyframe.tracks.depth.unit
-            prior = KeyframePrior(self.frames[guided[-1]].index, keyframe.affine[0] * unit, keyframe.affine[1] * unit)
-        return FrameUpdate(
-            frame.index, image.status, image.message, _pose(image), image.keyframe, len(image.tracks.ids),
-            image.inliers, mapper.new_points, mapper.parallax, image.covariance, prior, frame.dropped,
-            focal_length=mapper.focal, focal_changed=focal_changed,
-            starts_anew=mapper.starts_anew, note=mapper.note,
-        )  # fmt: skip
-
-    def _failure(self, message: str) -> ReconstructionError:
-        images = self._mapper.images if self._mapper is not None else []
-        frames = [
-            FrameResult(
-                frame.index, frame.name, frame.timestamp, image.status, image.message, _pose(image),
-                image.keyframe, len(image.tracks.ids), image.inliers,
-            )
-            for frame, image in zip(self.frames, images, strict=True)
-        ]  # fmt: skip
-        self._thumbnails.attach(frames)
-        return ReconstructionError(message, frames)
-
     def _read_depth(self, frame: Frame, xy: NDArray[np.float64]) -> ImageDepth | None:
         """The prior at keypoints; once there is a map, a frame on which it fails goes without."""
         assert self._depth is not None
         assert self._mapper is not None
         if frame.index in self._without_depth:
             return None
-        with self._timed("depth"):
+        with self.seconds.of("depth"):
             try:
                 return read_depth(self._depth, frame, xy)
             except ModelError as error:
@@ -400,23 +321,9 @@ class Stream(Closing):
                 self._without_depth[frame.index] = str(error)
                 return None
 
-    @contextmanager
-    def _timed(self, stage: str) -> Iterator[None]:
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[stage] += time.perf_counter() - start
-
 
 def _mark_blank(image: MappedImage, texture: float) -> None:
     """Where an image without texture is not registered, that is the reason to give."""
     if texture < BLANK_TEXTURE and not image.registered:
         image.status = FrameStatus.BLANK
         image.message = f"contrast {texture:.2f} of {BLANK_TEXTURE:.2f} needed grey levels"
-
-
-def _pose(image: MappedImage) -> pycolmap.Rigid3d | None:
-    if image.rotation is None:
-        return None
-    return pycolmap.Rigid3d(pycolmap.Rotation3d(image.rotation), image.translation)

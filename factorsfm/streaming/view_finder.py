@@ -11,7 +11,7 @@ from factorsfm.camera.projection import pixels_from_normalized
 from factorsfm.mapping.map_registration import visible
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.mapping.mapper import Mapper
-from factorsfm.streaming.relocalization import Relocalizer, View
+from factorsfm.streaming.relocalization import KeyframeView, Relocalizer
 from factorsfm.tracks.flow import FlowTracker
 
 Array = NDArray[np.float64]
@@ -28,7 +28,7 @@ class ViewFinder:
         views, next_view: see `Relocalizer`.
     """
 
-    def __init__(self, tracker: FlowTracker, views: Sequence[View] = (), next_view: int = 0) -> None:
+    def __init__(self, tracker: FlowTracker, views: Sequence[KeyframeView] = (), next_view: int = 0) -> None:
         self._tracker = tracker
         self.relocalizer = Relocalizer(views, next_view)
 

@@ -1,0 +1,109 @@
+"""A shot whose frames have all come: polished as a whole, or the reason why it cannot be reconstructed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from factorsfm.camera.guess import first_focal_std
+from factorsfm.camera.projection import normalized_from_pixels
+from factorsfm.control.known import Control, LocatedControl, locate
+from factorsfm.lens.camera_model import distortion_of
+from factorsfm.lens.rolling_shutter import Recording
+from factorsfm.mapping.mapper import Mapper
+from factorsfm.polish.polish import Polished, polish
+from factorsfm.priors.depth import DepthPrior
+from factorsfm.priors.depth_map import DepthKind
+from factorsfm.result.assembly import assemble
+from factorsfm.result.reconstruction import Reconstruction
+from factorsfm.streaming.frame_update import SeenFrame
+from factorsfm.support.errors import ReconstructionError
+from factorsfm.support.options import Options
+from factorsfm.support.stages import StageSeconds
+
+
+@dataclass(frozen=True, slots=True)
+class EndedShot:
+    """What a stream knows when the last frame has come.
+
+    Attributes:
+        frames: as they came; mapper: has an image of each, registered on the map as it is at last.
+        colors: (n, 3) RGB by track id.
+        camera: the lens of the mapper's images; lens_given: whether it is known, and no guess.
+        depth: the prior; without_depth: why it failed, by the frame's index.
+        control: what is known beforehand.
+        seconds: of the stages so far; that of the polish is added.
+    """
+
+    frames: Sequence[SeenFrame]
+    mapper: Mapper
+    colors: NDArray[np.uint8]
+    camera: pycolmap.Camera
+    lens_given: bool
+    depth: DepthPrior | None
+    without_depth: Mapping[int, str]
+    control: Control | None
+    options: Options
+    seconds: StageSeconds
+
+    def reconstruction(self, progress: Callable[[str, int, int | None], None] | None) -> Reconstruction:
+        """Polish over all frames and tracks; errors as in `Stream.finish`."""
+        control = self._located_control()
+        registered = sum(image.registered for image in self.mapper.images)
+        if registered < 2:
+            worst = next((i for i in self.mapper.images if not i.registered), self.mapper.images[0])
+            raise ReconstructionError(
+                f"{registered} of {len(self.frames)} frames registered, at least 2 needed; "
+                f"frame {self.frames[worst.tracks.position].index}: {worst.message}"
+            )
+        with self.seconds.of("polish"):
+            polished = self._polished(control, progress)
+        result = assemble(
+            polished,
+            self.mapper.images,
+            self.frames,
+            self.colors,
+            self.camera,
+            lens_given=self.lens_given,
+            prior_given=self.depth is not None,
+            metric=self.depth is not None and self.depth.kind is DepthKind.METRIC,
+            seconds=dict(self.seconds),
+            options=self.options.to_dict(),
+        )
+        if self.without_depth:
+            count, first = len(self.without_depth), next(iter(self.without_depth.values()))
+            result.notes.append(f"Frames that went without depth because the prior failed: {count}; {first}.")
+        if self.mapper.without_prior:
+            result.notes.append(f"The map went on without the depth prior: {self.mapper.without_prior}.")
+        return result
+
+    def _polished(
+        self, control: LocatedControl | None, progress: Callable[[str, int, int | None], None] | None
+    ) -> Polished:
+        return polish(
+            self.mapper.images,
+            self.mapper.points.all(),
+            np.array([self.mapper.focal]),
+            self.options,
+            lambda stage: progress(stage, 0, None) if progress else None,
+            distortion_of(self.camera) if self.options.estimates_lens else None,
+            control=control,
+            first_focal=(np.array([self.mapper.first_focal]), first_focal_std(self.camera, given=self.lens_given)),
+            recording=self._recording(),
+        )
+
+    def _recording(self) -> Recording | None:
+        """What a rolling shutter is looked for in."""
+        shutter = self.options.shutter
+        if shutter == "global" or (shutter == "auto" and self.control is not None):
+            return None
+        return Recording(self.camera.width, self.camera.height, np.array([frame.index for frame in self.frames]))
+
+    def _located_control(self) -> LocatedControl | None:
+        if self.control is None:
+            return None
+        return locate(self.control, self.frames, lambda position, xy: normalized_from_pixels(self.camera, xy))
