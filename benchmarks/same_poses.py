@@ -63,8 +63,12 @@ JOBS = {
 }
 
 
-def solve(job: Job, data: Path, models: Path) -> Arrays:
-    """The result of a job as arrays."""
+def solve(job: Job, data: Path, models: Path, work: Path) -> Arrays:
+    """The result of a job as arrays.
+
+    Args:
+        work: folder for the matches of a set, which differ a little from run to run.
+    """
     import factorsfm
     from factorsfm import MaskFolder, Stream
 
@@ -80,7 +84,7 @@ def solve(job: Job, data: Path, models: Path) -> Arrays:
             given = [stream.push(frame) for frame in factorsfm.read_frames(source)]
             result = stream.finish()
     else:
-        result = factorsfm.reconstruct(source, camera=camera, depth=depth, masks=masks, **dict(job.options))
+        result = factorsfm.reconstruct(source, camera=camera, depth=depth, masks=masks, work=work, **dict(job.options))
     return {
         "poses": _matrices([frame.cam_from_world for frame in result.frames]),
         "poses as given": _matrices([update.cam_from_world for update in given]),
@@ -133,7 +137,7 @@ def _compare(names: Sequence[str], before: Path, arguments: Sequence[str]) -> bo
     """Solve anew and print how far each job is from its record; whether all are within what is allowed."""
     good = True
     with tempfile.TemporaryDirectory() as folder:
-        _run_all(names, Path(folder), arguments)
+        _run_all(names, Path(folder), [*arguments, "--matches", str(before / "matches")])
         for name in names:
             old, new = (dict(np.load(place / f"{name}.npz")) for place in (before, Path(folder)))
             worst, changed = difference(old, new)
@@ -149,21 +153,25 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--models", type=Path, required=True)
+    parser.add_argument("--matches", type=Path, help="where the matches of sets lie; by default in the folder")
     parser.add_argument("--jobs", nargs="+", choices=list(JOBS), default=list(JOBS))
     arguments = parser.parse_args()
     rest = ["--data", str(arguments.data), "--models", str(arguments.models)]
     arguments.folder.mkdir(parents=True, exist_ok=True)
+    arguments.matches = arguments.matches or arguments.folder / "matches"
     actions: dict[str, Callable[[], bool]] = {
         "record": lambda: _run_all(arguments.jobs, arguments.folder, rest) is None,
         "compare": lambda: _compare(arguments.jobs, arguments.folder, rest),
-        "solve": lambda: _solve_here(arguments.jobs, arguments.folder, arguments.data, arguments.models),
+        "solve": lambda: _solve_here(
+            arguments.jobs, arguments.folder, arguments.matches, arguments.data, arguments.models
+        ),
     }
     sys.exit(0 if actions[arguments.action]() else 1)
 
 
-def _solve_here(names: Sequence[str], folder: Path, data: Path, models: Path) -> bool:
+def _solve_here(names: Sequence[str], folder: Path, matches: Path, data: Path, models: Path) -> bool:
     for name in names:
-        np.savez(folder / f"{name}.npz", **solve(JOBS[name], data, models))
+        np.savez(folder / f"{name}.npz", **solve(JOBS[name], data, models, matches / name))
     return True
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from factorsfm.support.errors import InputError
+from factorsfm.support.parallax import parallax as path_parallax
 from factorsfm.support.similarity import Similarity, align, check_trajectories, registered_frames
 
 Array = NDArray[np.float64]
@@ -154,7 +155,7 @@ def parallax(centers: Array, depths: ArrayLike) -> float:
     z = z[np.isfinite(z) & (z > 0)]
     if not len(known) or not len(z):
         raise InputError(f"parallax needs cameras and depths: {len(known)} cameras, {len(z)} depths given")
-    return float(np.linalg.norm(known - known[0], axis=1).max() / np.median(z))
+    return path_parallax(known, 1.0 / z)
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,17 +31,6 @@ def common_tracks(tracks: Sequence[ImageTracks]) -> Index:
     return common + common.T
 
 
-def components(joined: NDArray[np.bool_]) -> Index:
-    """(n,) label of the connected component of each node of an undirected graph."""
-    label = np.arange(len(joined))
-    while True:
-        lowest = np.where(joined, label[None], len(joined)).min(axis=1, initial=len(joined))
-        lower = np.minimum(label, lowest)
-        if np.array_equal(lower, label):
-            return label
-        label = lower
-
-
 def track_lengths(tracks: Sequence[ImageTracks]) -> Index:
     """By track id, in how many of the images it is seen."""
     return np.bincount(np.concatenate([t.ids for t in tracks]))

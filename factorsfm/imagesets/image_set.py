@@ -17,7 +17,7 @@ from factorsfm.camera.projection import PIXEL_CENTER, normalized_from_pixels, wi
 from factorsfm.control.known import Control, LocatedControl, locate
 from factorsfm.frames.frame import Frame, bgr_image
 from factorsfm.imagesets.cameras import describe_cameras, find_cameras
-from factorsfm.imagesets.mapper import SetMapper, map_parts
+from factorsfm.imagesets.mapper import SetMapper, for_image_sets, map_parts
 from factorsfm.imagesets.photo_folder import Photo, PhotoFolder
 from factorsfm.lens.camera_model import distortion_of, with_distortion
 from factorsfm.lens.lens import LensEstimate
@@ -87,7 +87,7 @@ class ImageSet:
         self._lens_is_open = camera is None and options.lens == "auto"
         if camera is None:
             options = options.for_unknown_lens()
-        self.options = _for_image_sets(options)
+        self.options = for_image_sets(options)
         self.photos: list[Photo] = []
         self.seconds = StageSeconds()
         self.notes: list[str] = []
@@ -282,15 +282,15 @@ class ImageSet:
         for p, part in enumerate(parts):
             for k, (photo, image) in enumerate(zip(self.photos, part.images, strict=True)):
                 if photo.left_out:
-                    image.status, image.message = FrameStatus.UNUSABLE, photo.left_out
+                    part.explain(k, FrameStatus.UNUSABLE, photo.left_out)
                 elif k in home and home[k] != p:
                     reason = "" if image.status is FrameStatus.REGISTERED else f"{image.message}; "
-                    image.status = FrameStatus.LOST
-                    image.message = f"{reason}it is in part {home[k] + 1}, of {parts[home[k]].registered} images"
-                elif photo.remark and not image.registered:
+                    place = f"it is in part {home[k] + 1}, of {parts[home[k]].registered} images"
+                    part.explain(k, FrameStatus.LOST, reason + place)
+                elif photo.remark:
                     blank = "keypoints" in photo.remark
-                    image.status = FrameStatus.BLANK if blank else image.status
-                    image.message = photo.remark if blank else f"{image.message}; {photo.remark}"
+                    status = FrameStatus.BLANK if blank else image.status
+                    part.explain(k, status, photo.remark if blank else f"{image.message}; {photo.remark}")
 
     def _add_twins(self, result: Reconstruction) -> None:
         """An image with the pixels of another one has its pose."""
@@ -359,16 +359,6 @@ class ImageSet:
                 status, reason = images[k].status, images[k].message
             frames.append(FrameResult(photo.index, photo.name, photo.timestamp, status, reason))
         return ReconstructionError(message, frames)
-
-
-def _for_image_sets(options: Options) -> Options:
-    """Two views make a track, wrong matches are single observations, and keypoints are less exact than tracks."""
-    return replace(
-        options,
-        polish=replace(
-            options.polish, min_track_length=2, final_iterations=20, observation_sigmas=12.0, doubtful_px=0.6
-        ),
-    )
 
 
 def _scaled(control: LocatedControl, ratio: float) -> LocatedControl:

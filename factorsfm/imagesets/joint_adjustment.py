@@ -18,6 +18,7 @@ from factorsfm.imagesets.mapper import SetMapper
 from factorsfm.polish.observability import camera_observability, pose_blocks
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.support.options import PolishOptions
+from factorsfm.support.parallax import parallax
 from factorsfm.support.similarity import Similarity, align, pose_arrays
 
 Array = NDArray[np.float64]
@@ -135,9 +136,7 @@ def extended(
     )
     result.observation_error = _errors(result)
     centers = result.camera_centers()
-    first = centers[0]
-    depth = 1.0 / np.median(1.0 / np.linalg.norm(result.points - first, axis=1))
-    result.parallax = float(np.linalg.norm(centers - first, axis=1).max() / depth)
+    result.parallax = parallax(centers, 1.0 / np.linalg.norm(result.points - centers[0], axis=1))
     return result
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,14 +16,18 @@ from numpy.typing import NDArray
 
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.gather import gather
-from factorsfm.imagesets.covisibility import common_tracks, components, longest_tracks, pyramid_score, track_lengths
-from factorsfm.imagesets.start import SIGMA_PX, median_angle, possible_starts
-from factorsfm.mapping.mapped_images import MappedImage, refocus, state_of
+from factorsfm.imagesets.covisibility import common_tracks, longest_tracks, pyramid_score, track_lengths
+from factorsfm.imagesets.start import median_angle, possible_starts
+from factorsfm.mapping.depth_fallback import DepthGuidance
+from factorsfm.mapping.incremental import IncrementalMapper, add_points, triangulate_tracks
+from factorsfm.mapping.mapped_images import MappedImage, state_of
 from factorsfm.mapping.point_map import PointMap
-from factorsfm.mapping.registration import register_image
+from factorsfm.mapping.registration import Registration
 from factorsfm.mapping.starts import NoStart, Start
-from factorsfm.mapping.triangulation import triangulate
+from factorsfm.support.components import connected_components
 from factorsfm.support.options import Options
+from factorsfm.support.parallax import parallax
+from factorsfm.support.rotations import camera_centers
 from factorsfm.support.status import FrameStatus
 from factorsfm.tracks.image_tracks import ImageTracks
 
@@ -39,6 +44,25 @@ _LEAST_FITTING, _MOST_CONTRADICTED = 0.5, 0.25  # shares of an image's observati
 _GROWTH = 0.1  # of the number of images after which the map is adjusted
 _GOOD_PX = 4.0  # reprojection error of a good observation
 _FOCAL_IMAGES, _FOCAL_ANGLE_DEG = 4, 3.0  # from which a guessed focal length is refined with the map
+
+
+def for_image_sets(options: Options) -> Options:
+    """Two views make a track, wrong matches are single observations, and keypoints are less exact than tracks.
+
+    Where views are far apart the prior adds nothing to a triangulation; the paper's presets use it all the same.
+    """
+    depth = options.mapper.triangulation_depth
+    return replace(
+        options,
+        mapper=replace(
+            options.mapper,
+            pixel_sigma=0.5,
+            triangulation_depth="none" if depth == "inverse" else depth,
+        ),
+        polish=replace(
+            options.polish, min_track_length=2, final_iterations=20, observation_sigmas=12.0, doubtful_px=0.6
+        ),
+    )
 
 
 def map_parts(tracks: list[ImageTracks], focal: float, options: Options) -> list[SetMapper]:
@@ -71,7 +95,7 @@ def map_parts(tracks: list[ImageTracks], focal: float, options: Options) -> list
     return sorted(parts, key=lambda part: -part.registered)
 
 
-class SetMapper:
+class SetMapper(IncrementalMapper):
     """Depth-guided incremental structure from motion over the tracks of an unordered set.
 
     Args:
@@ -85,13 +109,9 @@ class SetMapper:
     """
 
     def __init__(self, tracks: list[ImageTracks], focal: float, options: Options) -> None:
-        self.focal = focal
-        self.options = options.mapper
-        self._refine_focal = options.refine_focal_length
-        self.first_focal = focal
+        waiting = [MappedImage(t, FrameStatus.WAITING, "waiting for the start of the map") for t in tracks]
+        super().__init__(waiting, focal, options)
         self._adjustment = replace(options.polish, iterations=10, tolerance=1e-3)
-        self.images = [MappedImage(t, FrameStatus.WAITING, "waiting for the start of the map") for t in tracks]
-        self.points = PointMap()
         self._common = common_tracks(tracks)
         self._order: list[MappedImage] = []  # of registration; the first one is the world
         self._adjusted = 0
@@ -102,16 +122,10 @@ class SetMapper:
         self._angle = 0.0  # median angle between the rays of the latest points, degrees
 
     @property
-    def registered(self) -> int:
-        """Number of images with a pose."""
-        return sum(image.registered for image in self.images)
-
-    @property
     def parallax(self) -> float:
-        """Largest distance of a camera from the first one, over the median distance of the points from that."""
-        centers = np.array([-rotation.T @ translation for rotation, translation in (i.pose for i in self._order)])
-        distance = float(np.median(np.linalg.norm(self.points.all()[1] - centers[0], axis=1)))
-        return float(np.linalg.norm(centers - centers[0], axis=1).max()) / distance
+        """Of the registered images: largest distance from the first one over the median distance of the points."""
+        centers = camera_centers(*(np.array(part) for part in zip(*(image.pose for image in self._order), strict=True)))
+        return parallax(centers, 1.0 / np.linalg.norm(self.points.all()[1] - centers[0], axis=1))
 
     # --- the algorithm ------------------------------------------------------------------------------------------
 
@@ -150,8 +164,11 @@ class SetMapper:
             known: `cam_from_world` rotation and translation by position, the first one near the origin of a world with
                 a median distance of about 1.
         """
-        for position, pose in known.items():
-            self._accept(self.images[position], *pose, 0)
+        for position, (rotation, translation) in known.items():
+            image = self.images[position]
+            nothing = np.zeros(len(image.tracks.ids), bool)
+            given = Registration(rotation, translation, nothing, 0.0, self.options.inlier_px, np.zeros((6, 6)))
+            self._accept(image, given)
         self._held = set(known)
         self._grow(None)
         self._say_what_is_missing()
@@ -166,7 +183,7 @@ class SetMapper:
     def _usable(self) -> list[int]:
         """The images of the largest component; the others learn why they are left out."""
         o = self.options
-        component = components(self._common >= o.min_inliers)
+        component = connected_components(len(self._common), np.argwhere(self._common >= o.min_inliers))
         size = Counter(component.tolist())
         largest = max(size, key=lambda c: size[c])
         for image, c in zip(self.images, component.tolist(), strict=True):
@@ -212,9 +229,7 @@ class SetMapper:
         self.points, self._order, self._adjusted = PointMap(), [], 0
         self._released.clear()
         self._angle = median_angle(start)
-        self.points.set(start.ids, start.points)
-        for position, rotation, translation in zip(start.images, start.rotation, start.translation, strict=True):
-            self._accept(self.images[position], rotation, translation, len(start.ids))
+        self._accept_start(start)
 
     # --- registration -------------------------------------------------------------------------------------------
 
@@ -237,29 +252,16 @@ class SetMapper:
         return best
 
     def _register(self, image: MappedImage) -> bool:
-        o, tracks = self.options, image.tracks
-        mapped = self.points.contains(tracks.ids)
-        near = max(self._order, key=lambda i: int(self._common[i.tracks.position, tracks.position]))
-        result = register_image(
-            self.points.at(tracks.ids[mapped]),
-            tracks.xy[mapped],
-            *near.pose,
-            focal=self.focal,
-            sigma=SIGMA_PX,
-            inlier_px=o.inlier_px,
-        )
-        found = int(result.inliers.sum())
-        logger.debug("image %d: %d of %d inliers, %.2f px", tracks.position, found, mapped.sum(), result.error)
-        if found < o.min_inliers:
-            image.status = FrameStatus.TOO_FEW_INLIERS
-            image.message = f"{found} of {o.min_inliers} needed inliers among {mapped.sum()} mapped tracks"
-            return False
-        self._accept(image, result.rotation, result.translation, found)
-        return True
+        """Register an image from the pose of the one that shares most tracks with it."""
+        position = image.tracks.position
+        near = max(self._order, key=lambda i: int(self._common[i.tracks.position, position]))
+        done = self._register_near(image, near, in_order=False)
+        logger.debug("image %d: %s", position, image.message)
+        return done
 
-    def _accept(self, image: MappedImage, rotation: Array, translation: Array, inliers: int) -> None:
-        image.rotation, image.translation, image.inliers = rotation, translation, inliers
-        image.status, image.message, image.keyframe = FrameStatus.REGISTERED, f"{inliers} inliers", True
+    def _accept(self, image: MappedImage, found: Registration) -> None:
+        super()._accept(image, found)
+        image.keyframe = True
         self._order.append(image)
 
     # --- points -------------------------------------------------------------------------------------------------
@@ -277,21 +279,23 @@ class SetMapper:
         ids = ids[~self.points.contains(ids)]
         if not len(ids):
             return
-        result = triangulate(
-            np.array([i.rotation for i in order]),
-            np.array([i.translation for i in order]),
-            gather([i.tracks for i in order], ids),
-            focal=self.focal,
-            inlier_px=_GOOD_PX,
-            sigma=SIGMA_PX,
-            fallback=np.full(len(ids), 1e-3),
+        found = triangulate_tracks(
+            order, ids, self._guidance(order), focal=self.focal, inlier_px=_GOOD_PX, fallback=np.full(len(ids), 1e-3)
         )
-        angle = np.degrees(result.angle)
-        good = (result.inliers >= 2) & (result.inverse_distance > 1e-6)
+        angle = np.degrees(found.angle)
+        good = (found.inliers >= 2) & (found.inverse_distance > 1e-6)
         if good.any():
             self._angle = float(np.median(angle[good]))
         good &= angle > min(_LEAST_ANGLE_DEG, _LEAST_ANGLE_SHARE * self._angle)
-        self.points.set(ids[good], result.bearing[good] / result.inverse_distance[good, None])
+        add_points(self.points, ids, found, good)
+
+    def _guidance(self, images: Sequence[MappedImage]) -> DepthGuidance:
+        """The depth prior beside the map, fitted for each of these images where the options ask for it."""
+        guidance = DepthGuidance(self.options, self.points)
+        if self.options.triangulation_depth != "none":
+            for image in images:
+                guidance.fit(image)
+        return guidance
 
     def _adjust(self) -> None:
         """Bundle adjustment of all registered images; points without two good observations are forgotten."""
@@ -303,7 +307,7 @@ class SetMapper:
         observations = gather([image.tracks for image in self._order], ids)
         state = state_of(self._order, points, self.focal)
         errors = BundleAdjustment(state, observations, self._adjustment, sigma=1.0).reprojection_errors()
-        sigma = max(float(np.median(errors)), SIGMA_PX)
+        sigma = max(float(np.median(errors)), self.options.pixel_sigma)
         free_focal = self._refine_focal and len(self._order) >= _FOCAL_IMAGES and self._angle > _FOCAL_ANGLE_DEG
         held = np.array([image.tracks.position in self._held for image in self._order]) if self._held else None
         adjustment = BundleAdjustment(
@@ -345,7 +349,3 @@ class SetMapper:
         free = np.array([image.tracks.position not in settled for image in self._order])
         wrong = (share < _LEAST_FITTING) & free
         return wrong if wrong.sum() <= _MOST_CONTRADICTED * count else np.zeros(count, bool)
-
-    def _set_focal(self, focal: float) -> None:
-        refocus(self.images, focal / self.focal)
-        self.focal = focal

@@ -17,8 +17,6 @@ Index = NDArray[np.int64]
 
 logger = logging.getLogger(__name__)
 
-SIGMA_PX = 0.5  # of keypoints, until it is measured
-
 _MOST_COMMON_PAIRS = 300  # whose parallax is measured
 _STARTS_TRIED = 4
 _WIDE_ENOUGH_DEG = 8.0  # median angle of the rays beyond which a pair is no better for a start
@@ -39,7 +37,9 @@ def possible_starts(
     found: list[tuple[float, Start]] = []
     reason = f"{len(tracks)} of 2 needed images have tracks in common"
     for a, b in _pairs_with_parallax(tracks, common, options.min_tracks):
-        start = start_essential(tracks[a], tracks[b], options.min_tracks, focal=focal, sigma=SIGMA_PX, angle_deg=0.0)
+        start = start_essential(
+            tracks[a], tracks[b], options.min_tracks, focal=focal, sigma=options.pixel_sigma, angle_deg=0.0
+        )
         if isinstance(start, NoStart):
             reason = start.reason
             continue
@@ -81,7 +81,7 @@ def _start_from_depth(
         return NoStart("no image has a usable depth map")
     a, b = np.unravel_index(int(np.argmax(common[lifted])), (len(lifted), len(tracks)))
     pair = [tracks[lifted[a]], tracks[int(b)]]
-    return start_pair(pair, options.min_tracks, focal=focal, sigma=SIGMA_PX, inlier_px=options.inlier_px)
+    return start_pair(pair, options.min_tracks, focal=focal, sigma=options.pixel_sigma, inlier_px=options.inlier_px)
 
 
 def _parallax_deg(a: ImageTracks, b: ImageTracks) -> float:

@@ -31,13 +31,21 @@ class NotOnMap:
 
 
 def register_on_map(
-    image: MappedImage, points: PointMap, near: MappedImage, focal: float, options: MapperOptions
+    image: MappedImage,
+    points: PointMap,
+    near: MappedImage,
+    focal: float,
+    options: MapperOptions,
+    *,
+    in_order: bool,
 ) -> Registration | NotOnMap:
     """PnP on the mapped tracks, then refinement with the depth prior where the options say so.
 
     Args:
         near: the registered image whose pose is the first guess.
         focal: pixels.
+        in_order: whether `near` is its neighbour in time: then most of the inliers of `near` are expected here, too,
+            the more, the wider the threshold is.
 
     Returns:
         A registration whose inliers are marked among all tracks of the image, (n,).
@@ -62,17 +70,25 @@ def register_on_map(
         depth_weight=o.depth_weight,
     )
     found = int(result.inliers.sum())
-    # More agree by chance within a threshold that is suddenly wider, and what is seen may be something else: the
-    # more of its area is new, the more of the inliers before must still be there. A young map is always rough.
-    new_area = max(0.0, 1.0 - (near.threshold / result.threshold) ** 2)
-    most = max(o.min_inliers, _CONSENSUS * near.inliers)
-    needed = math.ceil(o.min_inliers + new_area**2 * (most - o.min_inliers))
+    needed = _needed_inliers(near, result.threshold, o.min_inliers) if in_order else o.min_inliers
     if found < needed:
         within = f"within {result.threshold:.1f} pixels among {mapped.sum()} mapped tracks"
         return NotOnMap(FrameStatus.TOO_FEW_INLIERS, f"{found} of {needed} needed inliers {within}")
     inliers = np.zeros(len(tracks.ids), bool)
     inliers[np.nonzero(mapped)[0][result.inliers]] = True
     return replace(result, inliers=inliers)
+
+
+def _needed_inliers(near: MappedImage, threshold: float, least: int) -> int:
+    """How many inliers an image needs beside its neighbour in time.
+
+    More tracks agree by chance within a threshold that is suddenly wider, and the image may show something else: the
+    more of the threshold's area is new, the more of the inliers before must still be there. A young map is always
+    rough.
+    """
+    new_area = max(0.0, 1.0 - (near.threshold / threshold) ** 2)
+    most = max(least, _CONSENSUS * near.inliers)
+    return math.ceil(least + new_area**2 * (most - least))
 
 
 def register_by_corners(

@@ -20,12 +20,12 @@ from factorsfm.adjustment.prior_term import joint_problem, usual_prior
 from factorsfm.adjustment.state import State
 from factorsfm.graph.keyframe_graph import FactorGraph, UpdateResult
 from factorsfm.mapping.depth_fallback import DepthGuidance
+from factorsfm.mapping.incremental import add_points, triangulate_tracks
 from factorsfm.mapping.mapped_images import MappedImage, state_of
 from factorsfm.mapping.point_map import PointMap
 from factorsfm.mapping.prior_check import inconsistency
 from factorsfm.mapping.registration import register_image
 from factorsfm.mapping.starts import lift
-from factorsfm.mapping.triangulation import triangulate
 from factorsfm.motion.burn_ins import contradicts, resting
 from factorsfm.priors.image_depth import ImageDepth
 from factorsfm.support.options import MapperOptions, PolishOptions
@@ -286,18 +286,11 @@ def _add_points(
     focal: float,
 ) -> int:
     """Triangulate tracks of `near` (ascending) from all images, and add what they agree on to the map."""
-    o = guidance.options
-    affine, prior = guidance.at_observations(images, ids)
-    result = triangulate(
-        np.array([image.rotation for image in images]),
-        np.array([image.translation for image in images]),
-        gather([image.tracks for image in images], ids),
-        focal=focal, inlier_px=o.inlier_px, sigma=o.pixel_sigma,
-        fallback=guidance.fallback(near, ids), affine=affine, prior=prior,
+    found = triangulate_tracks(
+        images, ids, guidance,
+        focal=focal, inlier_px=guidance.options.inlier_px, fallback=guidance.fallback(near, ids),
     )  # fmt: skip
-    good = (result.inliers >= 2) & (result.inverse_distance > _FARTHEST)
-    points.set(ids[good], result.bearing[good] / result.inverse_distance[good, None])
-    return int(good.sum())
+    return add_points(points, ids, found, (found.inliers >= 2) & (found.inverse_distance > _FARTHEST))
 
 
 def _problem(

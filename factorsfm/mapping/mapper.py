@@ -14,17 +14,19 @@ from numpy.typing import NDArray
 
 from factorsfm.graph.process import GraphProcess
 from factorsfm.mapping.graph_updates import submit_update
+from factorsfm.mapping.incremental import IncrementalMapper
 from factorsfm.mapping.keyframes import carry, is_keyframe
 from factorsfm.mapping.live_covariance import live_covariance
-from factorsfm.mapping.map_registration import NotOnMap, register_by_corners, register_on_map
+from factorsfm.mapping.map_registration import register_by_corners
 from factorsfm.mapping.map_update import YOUNG_KEYFRAMES, MapCopy, MapUpdate, add_tracks
-from factorsfm.mapping.mapped_images import MappedImage, refocus
+from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.mapping.point_map import PointMap
 from factorsfm.mapping.registration import Registration
 from factorsfm.mapping.starter import Starter
 from factorsfm.mapping.starts import NoStart, Start
 from factorsfm.priors.image_depth import ImageDepth
 from factorsfm.support.options import Options
+from factorsfm.support.parallax import parallax
 from factorsfm.support.status import FrameStatus
 from factorsfm.tracks.image_tracks import ImageTracks, shared_tracks
 
@@ -46,7 +48,7 @@ _SETTLED, _SETTLED_DELAY = 5, 2  # keyframes of a map that changes little; frame
 _REACH = 60  # images to both sides of a lost one from which its tracks are triangulated
 
 
-class Mapper:
+class Mapper(IncrementalMapper):
     """Depth-guided incremental structure from motion over tracks.
 
     Args:
@@ -57,11 +59,8 @@ class Mapper:
     """
 
     def __init__(self, graph: GraphProcess, focal: float, width: int, options: Options, *, has_prior: bool) -> None:
-        self.options = options.mapper
-        self.focal, self.first_focal = focal, focal
+        super().__init__([], focal, options)
         self.width = width
-        self._refine_focal = options.refine_focal_length
-        self.images: list[MappedImage] = []
         self.keyframes: list[int] = []
         self.burn_ins = np.zeros(0, np.int64)  # tracks that the last image showed to be laid over the image
         self.new_points = 0  # that came with the last image
@@ -79,7 +78,6 @@ class Mapper:
         )
         self._uses_keyframe_depth = has_prior and options.uses_depth
         self.started = False
-        self.points = PointMap()
         self._waits_for_depth = 0
         self._mirrored = 0  # updates in a row that were rolled back as mirrored
 
@@ -232,14 +230,9 @@ class Mapper:
                 image.message = start.reason
             return
         self.started = True
-        self.points.set(start.ids, start.points)
         self.new_points = len(start.ids)
         waiting = self._waiting()
-        for position, rotation, translation in zip(start.images, start.rotation, start.translation, strict=True):
-            image = next(i for i in waiting if i.tracks.position == position)
-            inliers = np.isin(image.tracks.ids, start.ids)
-            known = Registration(rotation, translation, inliers, 0.0, self.options.inlier_px, np.zeros((6, 6)))
-            self._accept(image, known)
+        for image in self._accept_start(start):
             self._add_keyframe(image, None)
             self._take_over()
         if len(start.images) == 1:
@@ -288,11 +281,7 @@ class Mapper:
 
     def _register(self, image: MappedImage) -> None:
         near = image if image.registered else self._nearest_registered(image.tracks.position)
-        found = register_on_map(image, self.points, near, self.focal, self.options)
-        if isinstance(found, NotOnMap):
-            image.status, image.message = found.status, found.message
-        else:
-            self._accept(image, found)
+        self._register_near(image, near, in_order=True)
 
     def relocalize(self, image: MappedImage, ids: Index, xy: Array) -> bool:
         """Register an image by what its descriptors say that it shows; whether that worked.
@@ -317,19 +306,30 @@ class Mapper:
                     return self.images[other]
         raise ValueError("no image is registered")
 
-    def _accept(self, image: MappedImage, result: Registration) -> None:
-        image.rotation, image.translation = result.rotation, result.translation
-        image.inliers, image.threshold = int(result.inliers.sum()), result.threshold
-        image.status = FrameStatus.REGISTERED
-        image.message = f"{image.inliers} inliers within {result.threshold:.1f} pixels"
-        if result.affine is not None:
-            image.affine = result.affine
+    def _accept(self, image: MappedImage, found: Registration) -> None:
+        super()._accept(image, found)
         solved = [self.images[k] for k in self.keyframes if self.images[k].covariance is not None]
-        image.covariance = live_covariance(image.pose, result.covariance, solved)
-        inverse = self.points.inverse_depths(image, result.inliers)
+        image.covariance = live_covariance(image.pose, found.covariance, solved)
+        inverse = self.points.inverse_depths(image, found.inliers)
         if len(inverse):  # the first camera is the world
-            moved = float(np.linalg.norm(result.translation))
-            self.parallax = max(self.parallax, moved * float(np.median(inverse)))
+            moved = np.stack([np.zeros(3), image.pose[0].T @ image.pose[1]])
+            self.parallax = max(self.parallax, parallax(moved, inverse))
+
+    def take_up_tracks(self, image: MappedImage, ids: Index, pixels: Array) -> None:
+        """Let an image observe further tracks.
+
+        Args:
+            ids: (n,) tracks; pixels: (n, 2) where they are.
+        """
+        joined = image.tracks.joined(ids, pixels)
+        image.tracks = joined.of(np.argsort(joined.ids))
+
+    def forget_tracks(self, ids: Index) -> None:
+        """Leave some tracks out of the images before the newest, which the graph may be working on."""
+        for image in self.images[:-1]:
+            keep = ~np.isin(image.tracks.ids, ids)
+            if not keep.all():
+                image.tracks = image.tracks.of(keep)
 
     # --- keyframes and landmarks --------------------------------------------------------------------------------
 
@@ -411,8 +411,3 @@ class Mapper:
             if image.registered or image.status in _NOT_JOINED:
                 image.forget(FrameStatus.WAITING, "waiting for a start without the depth prior")
         self._give_up_map(f"{self.note}; starting anew")
-
-    def _set_focal(self, focal: float) -> None:
-        """Normalise all that was seen with another focal length."""
-        refocus(self.images, focal / self.focal)
-        self.focal = focal

@@ -10,7 +10,6 @@ import pycolmap
 from numpy.typing import NDArray
 
 from factorsfm.adjustment.observations import DISTORTION
-from factorsfm.adjustment.state import State
 from factorsfm.camera.projection import with_focal
 from factorsfm.lens.camera_model import with_distortion
 from factorsfm.lens.lens import LensEstimate
@@ -19,6 +18,8 @@ from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.polish.polish import Polished
 from factorsfm.result.notes import notes_on, observability_notes, shutter_note
 from factorsfm.result.reconstruction import FrameResult, LensFit, PriorFit, Reconstruction, RollingShutter
+from factorsfm.support.parallax import parallax
+from factorsfm.support.rotations import camera_centers
 from factorsfm.support.similarity import Similarity
 from factorsfm.support.status import FrameStatus, ShotKind
 
@@ -113,7 +114,7 @@ def assemble(
         observation_error=polished.errors[keep],
         prior_residual=prior_residual[keep],
         kind=polished.motion.kind,
-        parallax=_parallax(state),
+        parallax=parallax(camera_centers(state.rotation, state.translation), state.inverse_distance),
         point_std=polished.point_std[kept] / state.inverse_distance[kept] if general else None,
         lens=_lens_fit(lens) if lens is not None else None,
         shutter=shutter,
@@ -146,13 +147,6 @@ def _usable_points(polished: Polished) -> tuple[NDArray[np.intp], NDArray[np.int
     row_of = np.full(len(inverse), -1)
     row_of[kept] = np.arange(len(kept))
     return kept, row_of
-
-
-def _parallax(state: State) -> float:
-    """Largest camera displacement over the median point depth."""
-    centers = -np.einsum("kji,kj->ki", state.rotation, state.translation)
-    depth = 1.0 / np.maximum(np.median(state.inverse_distance), 1e-9)
-    return float(np.linalg.norm(centers - centers[0], axis=1).max() / depth)
 
 
 def _metric_scale(polished: Polished, images: list[MappedImage]) -> float | None:

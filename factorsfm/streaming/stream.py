@@ -22,7 +22,6 @@ from factorsfm.frames.frame import Frame, as_frame
 from factorsfm.frames.texture import BLANK_TEXTURE
 from factorsfm.graph.process import GraphProcess
 from factorsfm.lens.camera_model import distortion_of
-from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.mapping.mapper import Mapper
 from factorsfm.priors.depth import DepthPrior
 from factorsfm.priors.image_depth import ImageDepth
@@ -135,11 +134,11 @@ class Stream(Closing):
         self._thumbnails.add(frame.image)
         if len(mapper.burn_ins):
             self._tracker.avoid(mapper.burn_ins)
-            self._forget(mapper, mapper.burn_ins)
+            mapper.forget_tracks(mapper.burn_ins)
         with self.seconds.of("relocalization"):
             self._finder.keep_in_sight(mapper, image, grey)
         if image.status is not FrameStatus.WAITING:  # it may still take part in the start
-            _mark_blank(image, tracked.texture)
+            _mark_blank(mapper, len(self.frames) - 1, tracked.texture)
         return frame_update(frame, image, mapper, self.frames, focal_changed=focal_changed)
 
     def trajectory(self) -> list[pycolmap.Rigid3d | None]:
@@ -248,8 +247,8 @@ class Stream(Closing):
         with self.seconds.of("mapping"):
             self._mapper.finish()
         self._follow_focal(self._mapper)
-        for image, seen in zip(self._mapper.images, self.frames, strict=True):
-            _mark_blank(image, seen.texture)
+        for position, seen in enumerate(self.frames):
+            _mark_blank(self._mapper, position, seen.texture)
         assert self.camera is not None
         return EndedShot(
             frames=self.frames,
@@ -268,13 +267,6 @@ class Stream(Closing):
         """End all threads and processes of the stream, with a result or without; `finish` closes, too."""
         self._closed = True
         self._held.close()
-
-    def _forget(self, mapper: Mapper, ids: NDArray[np.int64]) -> None:
-        """Tracks are left out of the images before the newest, which the graph may be working on."""
-        for image in mapper.images[:-1]:
-            keep = ~np.isin(image.tracks.ids, ids)
-            if not keep.all():
-                image.tracks = image.tracks.of(keep)
 
     def _open(self, frame: Frame) -> Mapper:
         """Everything that waits for the size of the first frame."""
@@ -322,8 +314,8 @@ class Stream(Closing):
                 return None
 
 
-def _mark_blank(image: MappedImage, texture: float) -> None:
+def _mark_blank(mapper: Mapper, position: int, texture: float) -> None:
     """Where an image without texture is not registered, that is the reason to give."""
-    if texture < BLANK_TEXTURE and not image.registered:
-        image.status = FrameStatus.BLANK
-        image.message = f"contrast {texture:.2f} of {BLANK_TEXTURE:.2f} needed grey levels"
+    if texture < BLANK_TEXTURE:
+        contrast = f"contrast {texture:.2f} of {BLANK_TEXTURE:.2f} needed grey levels"
+        mapper.explain(position, FrameStatus.BLANK, contrast)

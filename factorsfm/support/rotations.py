@@ -29,3 +29,8 @@ def nearest_rotation(matrix: Array) -> Array:
     u, _, vt = np.linalg.svd(matrix)
     rotation: Array = (u * [1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt
     return rotation
+
+
+def camera_centers(rotation: Array, translation: Array) -> Array:
+    """(n, 3) centres of cameras, from their `cam_from_world` rotations (n, 3, 3) and translations (n, 3)."""
+    return np.asarray(-np.einsum("nji,nj->ni", rotation, translation))

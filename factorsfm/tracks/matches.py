@@ -17,6 +17,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from factorsfm.camera.projection import PIXEL_CENTER
+from factorsfm.support.components import connected_components
 from factorsfm.tracks.learned import LearnedFeatures, find_all, likeness, match_pairs
 
 Array = NDArray[np.float64]
@@ -130,7 +131,7 @@ def join_tracks(keypoints: Sequence[Array], pairs: Sequence[PairMatches]) -> lis
     ordered = sorted(pairs, key=lambda p: -len(p.rows))
     ends = [node[p.rows + [first[p.first], first[p.second]]] for p in ordered]
     edges = np.concatenate([np.zeros((0, 2), np.int64), *ends])
-    label = _components(int(first[-1]), edges)
+    label = connected_components(int(first[-1]), edges)
     label = _split_inconsistent(label, edges, image_of)
     # Number the tracks with two images or more.
     used = np.unique(edges)
@@ -270,21 +271,6 @@ def _same_position(keypoints: Sequence[Array]) -> Index:
         nodes.append(offset + representative[inverse.reshape(-1)])
         offset += len(xy)
     return np.concatenate([np.zeros(0, np.int64), *nodes]).astype(np.int64)
-
-
-def _components(count: int, edges: Index) -> Index:
-    """(count,) smallest node of the connected component of each node."""
-    label = np.arange(count)
-    while True:
-        before = label.copy()
-        a, b = label[edges[:, 0]], label[edges[:, 1]]
-        smallest = np.minimum(a, b)
-        np.minimum.at(label, a, smallest)
-        np.minimum.at(label, b, smallest)
-        while not np.array_equal(label, label[label]):
-            label = label[label]
-        if np.array_equal(label, before):
-            return label
 
 
 def _split_inconsistent(label: Index, edges: Index, image_of: Index) -> Index:

@@ -31,8 +31,8 @@ from factorsfm.export import export
 from factorsfm.frames.unordered import Unusable, looks_unordered, other_files, read_images
 from factorsfm.imagesets.cameras import find_cameras
 from factorsfm.imagesets.covisibility import common_tracks, longest_tracks, pyramid_score
-from factorsfm.imagesets.image_set import ImageSet, _for_image_sets
-from factorsfm.imagesets.mapper import SetMapper, map_parts
+from factorsfm.imagesets.image_set import ImageSet
+from factorsfm.imagesets.mapper import SetMapper, for_image_sets, map_parts
 from factorsfm.imagesets.photo_folder import Photo, PhotoFolder
 from factorsfm.polish.polish import Polished, polish
 from factorsfm.priors.image_depth import ImageDepth
@@ -87,7 +87,7 @@ class Ring:
 
 
 def solve(tracks: list[ImageTracks], options: Options | None = None, focal: float = FOCAL) -> Polished:
-    options = _for_image_sets(options or Options())
+    options = for_image_sets(options or Options())
     mapper = SetMapper(tracks, focal, options)
     mapper.run()
     assert all(image.registered for image in mapper.images)
@@ -114,7 +114,7 @@ def test_without_noise_the_solution_is_exact() -> None:
 
 def test_an_image_that_the_map_contradicts_is_registered_again() -> None:
     ring = Ring()
-    mapper = SetMapper(ring.tracks(), FOCAL, _for_image_sets(Options()))
+    mapper = SetMapper(ring.tracks(), FOCAL, for_image_sets(Options()))
     mapper.run()
     spoiled, sound = mapper.images[3], mapper.images[3].pose
     turn = cv2.Rodrigues(np.array([0.0, 0.6, 0.1]))[0]

@@ -1,0 +1,126 @@
+"""What the mapper of video and that of image sets have in common: the map, and the steps that extend it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorsfm.adjustment.gather import gather
+from factorsfm.mapping.depth_fallback import DepthGuidance
+from factorsfm.mapping.map_registration import NotOnMap, register_on_map
+from factorsfm.mapping.mapped_images import MappedImage, refocus
+from factorsfm.mapping.point_map import PointMap
+from factorsfm.mapping.registration import Registration
+from factorsfm.mapping.starts import Start
+from factorsfm.mapping.triangulation import Triangulation, triangulate
+from factorsfm.support.options import Options
+from factorsfm.support.status import FrameStatus
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+class IncrementalMapper:
+    """A map of images and points that grows image by image.
+
+    Args:
+        focal: pixels; a guess where the options refine it.
+        options: steps, thresholds and weights.
+
+    Attributes:
+        images: all images, registered or not; points: the map.
+        focal: of the cameras of the images, their mean in pixels; first_focal: the one at the start.
+    """
+
+    def __init__(self, images: Sequence[MappedImage], focal: float, options: Options) -> None:
+        self.options = options.mapper
+        self.images = list(images)
+        self.points = PointMap()
+        self.focal, self.first_focal = focal, focal
+        self._refine_focal = options.refine_focal_length
+
+    @property
+    def registered(self) -> int:
+        """Number of images with a pose."""
+        return sum(image.registered for image in self.images)
+
+    def _register_near(self, image: MappedImage, near: MappedImage, *, in_order: bool) -> bool:
+        """Register an image on the map from the pose of a registered one; whether that works.
+
+        Args:
+            in_order: whether `near` is its neighbour in time, see `register_on_map`.
+        """
+        found = register_on_map(image, self.points, near, self.focal, self.options, in_order=in_order)
+        if isinstance(found, NotOnMap):
+            image.status, image.message = found.status, found.message
+            return False
+        self._accept(image, found)
+        return True
+
+    def _accept(self, image: MappedImage, found: Registration) -> None:
+        """Give an image its pose."""
+        image.rotation, image.translation = found.rotation, found.translation
+        image.inliers, image.threshold = int(found.inliers.sum()), found.threshold
+        image.status = FrameStatus.REGISTERED
+        image.message = f"{image.inliers} inliers within {found.threshold:.1f} pixels"
+        if found.affine is not None:
+            image.affine = found.affine
+
+    def _accept_start(self, start: Start) -> list[MappedImage]:
+        """The points of a start become the map, and its images get their poses; returns these images in order."""
+        self.points.set(start.ids, start.points)
+        by_position = {image.tracks.position: image for image in self.images}
+        images = [by_position[position] for position in start.images]
+        for image, rotation, translation in zip(images, start.rotation, start.translation, strict=True):
+            inliers = np.isin(image.tracks.ids, start.ids)
+            pose = Registration(rotation, translation, inliers, 0.0, self.options.inlier_px, np.zeros((6, 6)))
+            self._accept(image, pose)
+        return images
+
+    def explain(self, position: int, status: FrameStatus, message: str) -> None:
+        """Say why an image is not registered, where that is known better than by its tracks; no word if it is."""
+        image = self.images[position]
+        if not image.registered:
+            image.status, image.message = status, message
+
+    def _set_focal(self, focal: float) -> None:
+        """Go on with another focal length; what was seen stays as it is in pixels."""
+        refocus(self.images, focal / self.focal)
+        self.focal = focal
+
+
+def triangulate_tracks(
+    images: Sequence[MappedImage],
+    ids: Index,
+    guidance: DepthGuidance,
+    *,
+    focal: float,
+    inlier_px: float,
+    fallback: Array,
+) -> Triangulation:
+    """Points of some tracks (ascending ids) from the images that see them, with the depth prior of the options.
+
+    Args:
+        images: registered; focal, inlier_px: pixels.
+        fallback: (n,) inverse distance along the first ray where the views leave it open.
+    """
+    affine, prior = guidance.at_observations(images, ids)
+    return triangulate(
+        np.array([image.rotation for image in images]),
+        np.array([image.translation for image in images]),
+        gather([image.tracks for image in images], ids),
+        focal=focal,
+        inlier_px=inlier_px,
+        sigma=guidance.options.pixel_sigma,
+        fallback=fallback,
+        affine=affine,
+        prior=prior,
+    )
+
+
+def add_points(points: PointMap, ids: Index, found: Triangulation, good: NDArray[np.bool_]) -> int:
+    """Add those triangulated points that are good to the map; their number."""
+    points.set(ids[good], found.bearing[good] / found.inverse_distance[good, None])
+    return int(good.sum())
