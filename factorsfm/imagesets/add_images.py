@@ -29,7 +29,8 @@ from factorsfm.support.similarity import Similarity
 from factorsfm.support.status import FrameStatus, ShotKind
 from factorsfm.support.threads import OneThreadEach
 from factorsfm.tracks.image_tracks import ImageTracks
-from factorsfm.tracks.matches import join_tracks, match_images
+from factorsfm.tracks.match_tracks import tracks_from_matches
+from factorsfm.tracks.matches import match_images
 
 Progress = Callable[[str, int, int | None], None]
 
@@ -234,7 +235,7 @@ class _Extension:
             cameras.append(own)
         names = [view.file for view in views]
         matches = match_images(self._folder / "matches.db", self._folder / "images", names, cameras)
-        joined = join_tracks(matches.keypoints, matches.pairs)
+        joined = tracks_from_matches(matches.keypoints, matches.pairs)
         tracks = []
         for k, (view, keypoints, (ids, rows)) in enumerate(zip(views, matches.keypoints, joined, strict=True)):
             scale = np.array([camera.width, camera.height]) / view.size

@@ -36,7 +36,8 @@ from factorsfm.support.status import FrameStatus
 from factorsfm.support.threads import OneThreadEach
 from factorsfm.tracks.image_tracks import ImageTracks
 from factorsfm.tracks.learned import LearnedFeatures
-from factorsfm.tracks.matches import join_tracks, match_images
+from factorsfm.tracks.match_tracks import tracks_from_matches
+from factorsfm.tracks.matches import match_images
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, int, int | None], None]
@@ -201,7 +202,7 @@ class ImageSet:
             matches = match_images(
                 self._database, self._files.images, names, cameras, self._files.masks, self._features
             )
-            joined = join_tracks(matches.keypoints, matches.pairs)
+            joined = tracks_from_matches(matches.keypoints, matches.pairs)
         none = np.zeros(0, np.int64), np.zeros((0, 2))
         tracks = [ImageTracks(k, *none, self._cameras[photo.camera]) for k, photo in enumerate(self.photos)]
         for k, keypoints, (ids, rows) in zip(used, matches.keypoints, joined, strict=True):

@@ -1,4 +1,4 @@
-"""The colours of tracks, as they were where each was seen first."""
+"""The colours of tracks, from the frames in which they start."""
 
 from __future__ import annotations
 
@@ -7,22 +7,28 @@ from numpy.typing import NDArray
 
 
 class TrackColors:
-    """Colours by track id, which ascend in the order of appearance.
+    """The colours of n tracks; a track's id is its row.
 
     Attributes:
-        table: (n, 3) RGB.
+        table: (n, 3) uint8 RGB.
     """
 
     def __init__(self, table: NDArray[np.uint8] | None = None) -> None:
         self.table = np.zeros((0, 3), np.uint8) if table is None else table
 
     def remember(self, image: NDArray[np.uint8], ids: NDArray[np.int64], xy: NDArray[np.float64]) -> None:
-        """Keep the colours of the tracks that are new, at pixels (n, 2) of a BGR image."""
-        fresh = ids >= len(self.table)
-        if not fresh.any():
+        """Add the colours of the tracks that are new.
+
+        Args:
+            image: (h, w, 3) BGR.
+            ids: (n,) of the tracks, which count up as tracks start.
+            xy: (n, 2) pixels, centres at integers.
+        """
+        new = ids >= len(self.table)
+        if not new.any():
             return
-        x, y = np.rint(xy[fresh]).astype(int).T
-        pixels = image[y, x].reshape(int(fresh.sum()), -1)
+        x, y = np.rint(xy[new]).astype(int).T
+        pixels = image[y, x].reshape(int(new.sum()), -1)
         added = np.zeros((int(ids.max()) + 1 - len(self.table), 3), np.uint8)
-        added[ids[fresh] - len(self.table)] = pixels[:, ::-1]
+        added[ids[new] - len(self.table)] = pixels[:, ::-1]
         self.table = np.concatenate([self.table, added])

@@ -1,6 +1,6 @@
-"""Learned correspondences of image sets: XFeat keypoints, matched by LighterGlue, as networks in ONNX files.
+"""Learned features of image sets: XFeat keypoints, matched by LighterGlue, as networks in ONNX files.
 
-They go into the same database as SIFT's and are verified in the same way, so that all that follows is the same.
+They go into the same database as SIFT features and are verified in the same way.
 """
 
 from __future__ import annotations
@@ -27,25 +27,25 @@ Index = NDArray[np.int64]
 
 logger = logging.getLogger(__name__)
 
-_LONGEST_SIDE = 1600  # pixels; larger images are seen at this size
-_MULTIPLE_OF = 32  # of the network's input
-_KEYPOINTS = 2048  # an image: the matcher's cost grows with their square
+_LONGEST_SIDE_PX = 1600  # larger images are reduced to it
+_MULTIPLE_OF_PX = 32  # sides of the network's input
+_MOST_KEYPOINTS = 2048  # per image: the cost of matching grows with their square
 _LEAST_SCORE = 0.1  # of a match
-_STRONGEST = 512  # keypoints by which two images are compared before they are matched
-_SAME_FEATURE = 0.82  # cosine of descriptors that count as the same in this comparison, as XFeat's authors have it
-_LEAST_MATCHES = 15  # that a pair must have to be verified
+_COMPARED_KEYPOINTS = 512  # the strongest ones, by which `common_features` compares two images
+_SAME_DESCRIPTOR = 0.82  # cosine of two descriptors of the same feature there; the value of XFeat's authors
+_LEAST_MATCHES = 15  # of a pair that is verified
 
 
 @dataclass(frozen=True, slots=True)
 class FeatureSpec:
-    """A pair of networks: one finds keypoints, the other matches them.
+    """Two networks: one finds keypoints, the other matches them.
 
     Attributes:
         extractor: file whose inputs are ``image``, (1, 3, h, w) RGB in 0..1, and ``max_keypoints``, and whose outputs
             are keypoints (1, k, 2) in pixels, descriptors (1, k, d) of unit length and scores (1, k).
-        matcher: file whose inputs are ``kpts0``, ``kpts1``, ``desc0``, ``desc1`` as above, ``image_size0`` and
-            ``image_size1``, (1, 2) width and height, and whose outputs are, for each keypoint of the first image, that
-            of the second or -1, and a score in 0..1.
+        matcher: file whose inputs are ``kpts0``, ``kpts1``, ``desc0``, ``desc1`` as above, and ``image_size0``,
+            ``image_size1``, (1, 2) width and height. Its outputs are, for each keypoint of the first image, the row of
+            its match in the second one, or -1, and a score in 0..1.
     """
 
     extractor: str
@@ -57,10 +57,12 @@ FEATURES: dict[str, FeatureSpec] = {"xfeat": FeatureSpec("xfeat.onnx", "lighterg
 
 @dataclass(frozen=True, slots=True)
 class Keypoints:
-    """What is found in one image, the strongest first.
+    """The keypoints of one image, the strongest first.
 
     Attributes:
-        xy: (n, 2) pixels, centres at integers; descriptors: (n, d) of unit length; size: (width, height) of the image.
+        xy: (n, 2) pixels, centres at integers.
+        descriptors: (n, d) of unit length.
+        size: (width, height) of the image, pixels.
     """
 
     xy: Floats
@@ -72,11 +74,14 @@ class LearnedFeatures:
     """Keypoints and matches by networks.
 
     Args:
-        name: a key of `FEATURES`, whose files are looked for in the folder that ``FACTORSFM_MODELS`` names and in the
-            user's cache, or a folder that holds them.
+        name: a key of `FEATURES`, whose files are in the folder that ``FACTORSFM_MODELS`` names or in the user's cache;
+            or a folder that holds the files of "xfeat".
+
+    Attributes:
+        name: the key of `FEATURES`.
 
     Raises:
-        ModelError: a file is not there, or is no such network.
+        ModelError: a file is missing, or is another network.
     """
 
     def __init__(self, name: str | Path) -> None:
@@ -91,18 +96,19 @@ class LearnedFeatures:
         """The keypoints of an image.
 
         Args:
-            image: (h, w, 3) BGR; mask: (h, w), True where nothing is to be found.
+            image: (h, w, 3) BGR.
+            mask: (h, w), True = ignore.
         """
         height, width = image.shape[:2]
-        factor = min(1.0, _LONGEST_SIDE / max(height, width))
+        factor = min(1.0, _LONGEST_SIDE_PX / max(height, width))
         if factor < 1.0:
             size = max(1, round(width * factor)), max(1, round(height * factor))
             image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
         h, w = image.shape[:2]
-        below, right = -h % _MULTIPLE_OF, -w % _MULTIPLE_OF
+        below, right = -h % _MULTIPLE_OF_PX, -w % _MULTIPLE_OF_PX
         padded = cv2.copyMakeBorder(image, 0, below, 0, right, cv2.BORDER_REPLICATE)
         values = np.ascontiguousarray(padded[None, ..., ::-1].transpose(0, 3, 1, 2), np.float32) / np.float32(255.0)
-        inputs = {"image": values, "max_keypoints": np.array(_KEYPOINTS, np.int64)}
+        inputs = {"image": values, "max_keypoints": np.array(_MOST_KEYPOINTS, np.int64)}
         xy, descriptors, scores = (output[0] for output in self._extractor.run(None, inputs))
         xy = (xy + PIXEL_CENTER) * (np.array([width, height]) / (w, h)) - PIXEL_CENTER
         good = (scores > 0) & (xy <= (width - 1, height - 1)).all(axis=1)
@@ -113,7 +119,7 @@ class LearnedFeatures:
         return Keypoints(xy[order].astype(np.float32), descriptors[order].astype(np.float32), (width, height))
 
     def match(self, a: Keypoints, b: Keypoints) -> Index:
-        """(m, 2) keypoints of the first and of the second image."""
+        """Matches of two images: (m, 2) rows of keypoints of the first and of the second one."""
         inputs: dict[str, Floats] = {}
         for i, k in enumerate((a, b)):
             inputs |= {f"kpts{i}": k.xy[None], f"desc{i}": k.descriptors[None]}
@@ -123,25 +129,31 @@ class LearnedFeatures:
         return np.stack([rows, other[rows]], 1).astype(np.int64)
 
 
-def likeness(images: Sequence[Keypoints]) -> Index:
-    """(n, n) how many of their strongest keypoints are mutual nearest neighbours, 0 on the diagonal."""
+def common_features(images: Sequence[Keypoints]) -> Index:
+    """(n, n) number of mutual nearest neighbours among the strongest keypoints of two images, 0 on the diagonal."""
     n = len(images)
-    strongest = [k.descriptors[:_STRONGEST] for k in images]
-    alike = np.zeros((n, n), np.int64)
+    strongest = [k.descriptors[:_COMPARED_KEYPOINTS] for k in images]
+    common = np.zeros((n, n), np.int64)
     for i in range(n):
         for j in range(i + 1, n):
             if len(strongest[i]) and len(strongest[j]):
                 cosine = strongest[i] @ strongest[j].T
                 there, back = cosine.argmax(1), cosine.argmax(0)
                 best = cosine[np.arange(len(there)), there]
-                alike[i, j] = ((back[there] == np.arange(len(there))) & (best > _SAME_FEATURE)).sum()
-    return alike + alike.T
+                common[i, j] = ((back[there] == np.arange(len(there))) & (best > _SAME_DESCRIPTOR)).sum()
+    return common + common.T
 
 
 def find_all(
     database: Path, images: Path, names: Sequence[str], features: LearnedFeatures, masks: Path | None
 ) -> list[Keypoints]:
-    """Keypoints of all images, from the database where they are in it, else found and written to it."""
+    """Keypoints of all images: read from the database, or found and written to it.
+
+    Args:
+        database: holds all images.
+        images: folder of the image files; names: the files, in order.
+        masks: folder with a file "NAME.png" for every image, zero = ignore.
+    """
     found = []
     with pycolmap.Database.open(database) as db:
         for name in names:
@@ -170,7 +182,12 @@ def match_pairs(
     features: LearnedFeatures,
     verification: pycolmap.TwoViewGeometryOptions,
 ) -> None:
-    """Match pairs of images that are not matched yet, and verify them; all of it goes into the database."""
+    """Match and verify pairs of images, as far as they are not in the database yet, and write them to it.
+
+    Args:
+        names, keypoints: of all images, in order.
+        pairs: positions of two images.
+    """
     lines = []
     with pycolmap.Database.open(database) as db:
         ids = [db.read_image_with_name(name).image_id for name in names]
@@ -196,13 +213,13 @@ def _open(folders: Sequence[Path], file: str, spec: FeatureSpec, inputs: set[str
     if path is None:
         raise ModelError(
             f"the network {file} is in none of {', '.join(map(str, folders))}: set {MODELS_VARIABLE} to a folder that "
-            f"holds {spec.extractor} and {spec.matcher}, or name that folder instead of the features"
+            f"holds {spec.extractor} and {spec.matcher}, or give that folder in place of the name"
         )
     session = open_session(path)
     found = {i.name for i in session.get_inputs()}
     if found != inputs:
         raise ModelError(
-            f"{path} is not the network expected: its inputs are {', '.join(sorted(found))}, "
-            f"not {', '.join(sorted(inputs))}"
+            f"{path} is another network: its inputs are {', '.join(sorted(found))}; "
+            f"{', '.join(sorted(inputs))} are expected"
         )
     return session

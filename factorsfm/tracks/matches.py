@@ -1,6 +1,6 @@
-"""Correspondences of image sets, through pycolmap: features, pairs, verified matches, and the tracks they form.
+"""Matches of image sets, through pycolmap: features, pairs to match, geometric verification.
 
-The database lies in a work folder. Images that have features and pairs that are verified are not touched again, so an
+The database lies in a work folder. Images with features and verified pairs are not computed again, so that an
 interrupted run goes on where it stopped.
 """
 
@@ -17,19 +17,18 @@ import pycolmap
 from numpy.typing import NDArray
 
 from factorsfm.camera.projection import PIXEL_CENTER
-from factorsfm.support.components import connected_components
-from factorsfm.tracks.learned import LearnedFeatures, find_all, likeness, match_pairs
+from factorsfm.tracks.learned import LearnedFeatures, common_features, find_all, match_pairs
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 logger = logging.getLogger(__name__)
 
-MAX_FEATURES = 8192
-EXHAUSTIVE_UP_TO = 60  # images; above, each is matched with those that look most alike and its neighbours by name
-_NEIGHBOURS_ALIKE, _NEIGHBOURS_BY_NAME = 25, 4
-_WORDS, _WORD_SAMPLE = 256, 100_000  # of the vocabulary, which is made from the set itself
-_ONE_THREAD_ABOVE = 6e6  # pixels: SIFT needs about 150 bytes for each of them
+MAX_FEATURES = 8192  # per image
+EXHAUSTIVE_UP_TO = 60  # images; in a larger set each is matched with its neighbours by appearance and by name
+_NEIGHBOURS_BY_APPEARANCE, _NEIGHBOURS_BY_NAME = 25, 4
+_VISUAL_WORDS, _SAMPLED_DESCRIPTORS = 256, 100_000  # of the vocabulary, which is made from the set itself
+_ONE_THREAD_ABOVE = 6e6  # pixels of an image: SIFT needs about 150 bytes for each of them
 _SEED = 0
 
 
@@ -49,11 +48,11 @@ class PairMatches:
 
 @dataclass(frozen=True, slots=True)
 class SetMatches:
-    """What joins the images of a set.
+    """The keypoints of a set and their matches.
 
     Attributes:
         keypoints: per image (n, 2) pixels, centres at integers.
-        pairs: verified matches.
+        pairs: verified matches, sorted by their images.
     """
 
     keypoints: list[Array]
@@ -68,18 +67,19 @@ def match_images(
     masks: Path | None = None,
     features: LearnedFeatures | None = None,
 ) -> SetMatches:
-    """Features of all images, matches of all pairs worth a try, verified by epipolar geometry.
+    """Find features, match all promising pairs and verify them by epipolar geometry.
 
     Args:
-        database: made if absent; one of other images is replaced.
-        images: folder of the image files; names: the files, in order.
-        cameras: of each image; `has_prior_focal_length` decides whether the lens takes part in the verification.
+        database: the file; made if it does not exist, replaced if it is of other images.
+        images: folder of the image files.
+        names: the files, in order.
+        cameras: one per image; `has_prior_focal_length` decides whether the verification uses the lens.
         masks: folder with a file "NAME.png" for every image, zero = ignore.
-        features: None is SIFT. A database holds one kind of them.
+        features: None for SIFT. A database holds features of one kind.
     """
     pycolmap.set_random_seed(_SEED)
     if database.exists() and not _stored_names(database) <= set(names):
-        logger.info("the matches in %s are of other images and are made anew", database)
+        logger.info("the matches in %s are of other images and are computed again", database)
         database.unlink()
     with _quiet_colmap():
         if features is not None:
@@ -89,12 +89,12 @@ def match_images(
         if len(names) <= EXHAUSTIVE_UP_TO:
             pycolmap.match_exhaustive(database, verification_options=_verification())
         else:
-            _match_alike(database, len(names))
+            _match_neighbours(database, len(names))
     return read_matches(database, names)
 
 
 def read_matches(database: Path, names: Sequence[str]) -> SetMatches:
-    """The content of a database; images that are not in it have no keypoints."""
+    """The content of a database; an image that is not in it has no keypoints."""
     keypoints = []
     with pycolmap.Database.open(database) as db:
         position = {}
@@ -110,43 +110,10 @@ def read_matches(database: Path, names: Sequence[str]) -> SetMatches:
             rows = np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)
             if len(rows) and a in position and b in position:
                 first, second = position[a], position[b]
-                if first > second:  # the database numbers images as their features got ready
+                if first > second:  # the database numbers images in the order in which their features were found
                     first, second, rows = second, first, rows[:, ::-1]
                 pairs.append(PairMatches(first, second, rows))
     return SetMatches(keypoints, sorted(pairs, key=lambda pair: (pair.first, pair.second)))
-
-
-def join_tracks(keypoints: Sequence[Array], pairs: Sequence[PairMatches]) -> list[tuple[Index, Index]]:
-    """Tracks: what is connected by matches, directly or through other images.
-
-    A track sees an image once. Where matches join two different keypoints of an image, the matches of the pairs with
-    most matches come first, and those that would join such tracks are dropped.
-
-    Returns:
-        Per image the ids of its tracks (ascending) and the rows of their keypoints.
-    """
-    first = np.concatenate([[0], np.cumsum([len(k) for k in keypoints])]).astype(np.int64)
-    node = _same_position(keypoints)
-    image_of = np.repeat(np.arange(len(keypoints)), np.diff(first))
-    ordered = sorted(pairs, key=lambda p: -len(p.rows))
-    ends = [node[p.rows + [first[p.first], first[p.second]]] for p in ordered]
-    edges = np.concatenate([np.zeros((0, 2), np.int64), *ends])
-    label = connected_components(int(first[-1]), edges)
-    label = _split_inconsistent(label, edges, image_of)
-    # Number the tracks with two images or more.
-    used = np.unique(edges)
-    count = np.bincount(label[used], minlength=int(first[-1]))
-    used = used[count[label[used]] >= 2]
-    _, ids = np.unique(label[used], return_inverse=True)
-    result = []
-    for i in range(len(keypoints)):
-        mine = (used >= first[i]) & (used < first[i + 1])
-        order = np.argsort(ids[mine])
-        result.append((ids[mine][order].astype(np.int64), used[mine][order] - first[i]))
-    return result
-
-
-# --- features and pairs -----------------------------------------------------------------------------------------
 
 
 def _stored_names(database: Path) -> set[str]:
@@ -192,7 +159,7 @@ def _verification() -> pycolmap.TwoViewGeometryOptions:
 
 @contextmanager
 def _quiet_colmap() -> Iterator[None]:
-    """Keep COLMAP from writing its progress to stderr, past all Python logging."""
+    """Keep COLMAP from writing progress to stderr, past all Python logging."""
     level = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = max(level, int(pycolmap.logging.Level.ERROR))
     try:
@@ -201,19 +168,19 @@ def _quiet_colmap() -> Iterator[None]:
         pycolmap.logging.minloglevel = level
 
 
-def _match_alike(database: Path, count: int) -> None:
-    """Each image with those that look most alike, by a vocabulary tree, and with its neighbours by name."""
+def _match_neighbours(database: Path, count: int) -> None:
+    """Match each image with its neighbours by appearance, from a vocabulary tree, and with its neighbours by name."""
     vocabulary = database.with_suffix(".vocabulary")
     if not vocabulary.exists():
         _build_vocabulary(database, vocabulary)
-    alike = pycolmap.VocabTreePairingOptions()
-    alike.vocab_tree_path = vocabulary
-    alike.num_images = min(_NEIGHBOURS_ALIKE, count - 1)
-    pycolmap.match_vocabtree(database, pairing_options=alike, verification_options=_verification())
-    neighbours = pycolmap.SequentialPairingOptions()
-    neighbours.overlap = _NEIGHBOURS_BY_NAME
-    neighbours.quadratic_overlap = False
-    pycolmap.match_sequential(database, pairing_options=neighbours, verification_options=_verification())
+    by_appearance = pycolmap.VocabTreePairingOptions()
+    by_appearance.vocab_tree_path = vocabulary
+    by_appearance.num_images = min(_NEIGHBOURS_BY_APPEARANCE, count - 1)
+    pycolmap.match_vocabtree(database, pairing_options=by_appearance, verification_options=_verification())
+    by_name = pycolmap.SequentialPairingOptions()
+    by_name.overlap = _NEIGHBOURS_BY_NAME
+    by_name.quadratic_overlap = False
+    pycolmap.match_sequential(database, pairing_options=by_name, verification_options=_verification())
 
 
 def _match_learned(
@@ -224,76 +191,38 @@ def _match_learned(
     masks: Path | None,
     features: LearnedFeatures,
 ) -> None:
-    """The same with keypoints and matches by networks; what looks alike, the keypoints themselves say."""
-    with pycolmap.Database.open(database) as db:  # makes it
+    """Find and match learned features; neighbours by appearance share most of their strongest keypoints."""
+    with pycolmap.Database.open(database) as db:  # makes the file
         new = [name for name in names if db.read_image_with_name(name) is None]
     if new:
         pycolmap.import_images(database, images, camera_mode=pycolmap.CameraMode.PER_IMAGE, image_names=new)
     _set_cameras(database, names, cameras)
     keypoints = find_all(database, images, names, features, masks)
-    near = np.abs(np.subtract.outer(np.arange(len(names)), np.arange(len(names))))
-    chosen = near > 0
+    distance = np.abs(np.subtract.outer(np.arange(len(names)), np.arange(len(names))))
+    chosen = distance > 0
     if len(names) > EXHAUSTIVE_UP_TO:
-        rank = np.argsort(np.argsort(-likeness(keypoints), axis=1, kind="stable"), axis=1)
-        chosen &= (near <= _NEIGHBOURS_BY_NAME) | (rank < _NEIGHBOURS_ALIKE)
+        rank = np.argsort(np.argsort(-common_features(keypoints), axis=1, kind="stable"), axis=1)
+        chosen &= (distance <= _NEIGHBOURS_BY_NAME) | (rank < _NEIGHBOURS_BY_APPEARANCE)
     first, second = np.nonzero(np.triu(chosen | chosen.T))
     pairs = list(zip(first.tolist(), second.tolist(), strict=True))
     match_pairs(database, names, keypoints, pairs, features, _verification())
 
 
 def _build_vocabulary(database: Path, path: Path) -> None:
+    """Write a vocabulary of visual words, from a random sample of the descriptors in the database."""
     with pycolmap.Database.open(database) as db:
         ids = [image.image_id for image in db.read_all_images()]
-        share = _WORD_SAMPLE // len(ids)
+        per_image = _SAMPLED_DESCRIPTORS // len(ids)
         rng = np.random.default_rng(_SEED)
         sample = []
         for image_id in ids:
             data = np.asarray(db.read_descriptors(image_id).data)
-            sample.append(data[rng.permutation(len(data))[:share]])
+            sample.append(data[rng.permutation(len(data))[:per_image]])
     descriptors = pycolmap.FeatureDescriptorsFloat()
     descriptors.type = pycolmap.FeatureExtractorType.SIFT
     descriptors.data = np.concatenate(sample).astype(np.float32)
     index = pycolmap.VisualIndex.create(128, 64)
     options = pycolmap.VisualIndex.BuildOptions()
-    options.num_visual_words = _WORDS
+    options.num_visual_words = _VISUAL_WORDS
     index.build(options, descriptors)
     index.write(path)
-
-
-# --- tracks -----------------------------------------------------------------------------------------------------
-
-
-def _same_position(keypoints: Sequence[Array]) -> Index:
-    """For every keypoint of the set the first one at its place: SIFT repeats a keypoint for each orientation."""
-    nodes, offset = [], 0
-    for xy in keypoints:
-        _, representative, inverse = np.unique(xy, axis=0, return_index=True, return_inverse=True)
-        nodes.append(offset + representative[inverse.reshape(-1)])
-        offset += len(xy)
-    return np.concatenate([np.zeros(0, np.int64), *nodes]).astype(np.int64)
-
-
-def _split_inconsistent(label: Index, edges: Index, image_of: Index) -> Index:
-    """Components that see an image twice are joined again, edge by edge, without doing so."""
-    nodes = np.unique(edges)
-    seen, count = np.unique(np.stack([label[nodes], image_of[nodes]]), axis=1, return_counts=True)
-    doubtful = np.zeros(len(label), bool)
-    doubtful[seen[0, count > 1]] = True
-    label = label.copy()
-    inside = nodes[doubtful[label[nodes]]]
-    members = {int(n): [int(n)] for n in inside}
-    root = {int(n): int(n) for n in inside}
-    images = {int(n): {int(image_of[n])} for n in inside}
-    for a, b in edges[doubtful[label[edges[:, 0]]]].tolist():
-        a, b = root[a], root[b]
-        if a == b or not images[a].isdisjoint(images[b]):
-            continue
-        if len(members[a]) < len(members[b]):
-            a, b = b, a
-        for n in members[b]:
-            root[n] = a
-        members[a] += members.pop(b)
-        images[a] |= images.pop(b)
-    for group in members.values():
-        label[group] = min(group)
-    return label

@@ -251,7 +251,7 @@ def test_memory_is_bounded():
     for image in images + images[::-1] + images:
         tracker.track(image)
         sizes.append(sum(array.nbytes for array in arrays(tracker.state())))
-    assert tracker.state()["_next_id"] > 3 * OPTIONS.max_tracks / 2
+    assert tracker.state()["next_id"] > 3 * OPTIONS.max_tracks / 2
     assert len(tracker.ended) <= 3000
     per_track = 45 * 45 + 25 * 25 + 100
     assert max(sizes) <= images[0].shape[0] * images[0].shape[1] + (OPTIONS.max_tracks + 3000) * per_track

@@ -14,7 +14,7 @@ from factorsfm.evaluation.readers import read_shot
 from factorsfm.support.similarity import pose_arrays
 from factorsfm.synthetic import RenderedShot, render_shot
 from factorsfm.tracks import matches
-from factorsfm.tracks.learned import FEATURES, Keypoints, LearnedFeatures, likeness
+from factorsfm.tracks.learned import FEATURES, Keypoints, LearnedFeatures, common_features
 from factorsfm.tracks.matches import match_images
 from tests.priors.test_models import save_network
 from tests.tracks.test_matches import write_images
@@ -98,7 +98,7 @@ def test_large_sets_are_paired_by_their_strongest_keypoints(
 ) -> None:
     """Images and their mirror images: each has one like itself, far away in the order of names."""
     monkeypatch.setattr(matches, "EXHAUSTIVE_UP_TO", 2)
-    monkeypatch.setattr(matches, "_NEIGHBOURS_ALIKE", 1)
+    monkeypatch.setattr(matches, "_NEIGHBOURS_BY_APPEARANCE", 1)
     monkeypatch.setattr(matches, "_NEIGHBOURS_BY_NAME", 0)
     (tmp_path / "images").mkdir()
     pictures = [shot.images[0], cv2.flip(shot.images[0], 1), cv2.flip(shot.images[2], 1), shot.images[2]]
@@ -110,10 +110,10 @@ def test_large_sets_are_paired_by_their_strongest_keypoints(
     assert features.matched == 2
 
 
-def test_likeness_counts_mutual_nearest_neighbours() -> None:
+def test_common_features_are_mutual_nearest_neighbours() -> None:
     one = np.eye(8, dtype=np.float32)
     images = [Keypoints(np.zeros((len(d), 2), np.float32), d, (9, 9)) for d in (one, one[[1, 2, 3]], -one, one[:0])]
-    assert likeness(images).tolist() == [[0, 3, 0, 0], [3, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]]
+    assert common_features(images).tolist() == [[0, 3, 0, 0], [3, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]]
 
 
 def test_a_missing_network_is_one_sentence(
@@ -136,7 +136,7 @@ def test_a_missing_network_is_one_sentence(
 
 def test_another_network_is_refused(tmp_path: Path) -> None:
     save_network(tmp_path / FEATURES["xfeat"].extractor, [1, 3, 32, 32])
-    with pytest.raises(ModelError, match="is not the network expected: its inputs are"):
+    with pytest.raises(ModelError, match="is another network: its inputs are"):
         LearnedFeatures(tmp_path)
 
 

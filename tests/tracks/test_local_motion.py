@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from factorsfm.tracks.flow import _robust_fit
+from factorsfm.tracks.frame_flow import robust_fit
 from factorsfm.tracks.local_motion import LocalMotion
 
 SHAPE = (540, 960)
@@ -51,5 +51,5 @@ def test_a_fit_that_a_third_of_the_rows_contradict() -> None:
     true = rng.normal(0, 3, (5, 2))
     effect = cause @ true + rng.normal(0, 0.05, (60, 2))
     effect[::3] += rng.uniform(8, 20, (20, 2))
-    assert np.abs(_robust_fit(cause, effect.astype(np.float32)) - true).max() < 0.15
-    assert not _robust_fit(cause[:9], effect[:9].astype(np.float32)).any()  # too few to tell
+    assert np.abs(robust_fit(cause, effect.astype(np.float32)) - true).max() < 0.15
+    assert not robust_fit(cause[:9], effect[:9].astype(np.float32)).any()  # too few to tell

@@ -9,7 +9,8 @@ import pytest
 
 from factorsfm.synthetic import RenderedShot, render_shot
 from factorsfm.tracks import matches
-from factorsfm.tracks.matches import PairMatches, join_tracks, match_images, read_matches
+from factorsfm.tracks.match_tracks import tracks_from_matches
+from factorsfm.tracks.matches import PairMatches, match_images, read_matches
 
 
 def keypoints(*counts: int) -> list[np.ndarray]:
@@ -32,7 +33,9 @@ def as_sets(joined: list[tuple[np.ndarray, np.ndarray]]) -> set[frozenset[tuple[
 
 
 def test_matches_join_through_other_images() -> None:
-    joined = join_tracks(keypoints(3, 3, 3, 2), [pair(0, 1, (0, 2), (1, 1)), pair(1, 2, (2, 0)), pair(2, 3, (1, 1))])
+    joined = tracks_from_matches(
+        keypoints(3, 3, 3, 2), [pair(0, 1, (0, 2), (1, 1)), pair(1, 2, (2, 0)), pair(2, 3, (1, 1))]
+    )
     assert as_sets(joined) == {
         frozenset({(0, 0), (1, 2), (2, 0)}),
         frozenset({(0, 1), (1, 1)}),
@@ -41,19 +44,19 @@ def test_matches_join_through_other_images() -> None:
 
 
 def test_no_matches_no_tracks() -> None:
-    assert as_sets(join_tracks(keypoints(3, 0, 2), [])) == set()
+    assert as_sets(tracks_from_matches(keypoints(3, 0, 2), [])) == set()
 
 
 def test_keypoints_at_one_place_are_one() -> None:
     points = keypoints(2, 2, 2)
     points[1][1] = points[1][0]  # the second orientation of the same keypoint
-    joined = join_tracks(points, [pair(0, 1, (0, 0)), pair(1, 2, (1, 1))])
+    joined = tracks_from_matches(points, [pair(0, 1, (0, 0)), pair(1, 2, (1, 1))])
     assert as_sets(joined) == {frozenset({(0, 0), (1, 0), (2, 1)})}
 
 
 def test_a_track_that_sees_an_image_twice_is_split_where_fewest_matches_join_it() -> None:
     strong = [(i, i) for i in range(1, 6)]
-    joined = join_tracks(
+    joined = tracks_from_matches(
         keypoints(8, 8, 8),
         [pair(0, 1, (0, 0), *strong), pair(1, 2, (0, 0), *strong[:4]), pair(0, 2, (7, 0), (6, 6))],
     )
@@ -86,7 +89,7 @@ def test_components_agree_with_a_search_of_the_graph() -> None:
             todo += [m for m in neighbours[node] if m in left]
             left -= neighbours[node]
         expected.add(frozenset(component))
-    assert as_sets(join_tracks(points, pairs)) == expected
+    assert as_sets(tracks_from_matches(points, pairs)) == expected
 
 
 @pytest.fixture(scope="module")
@@ -154,9 +157,11 @@ def test_masked_pixels_give_no_keypoints(shot: RenderedShot, tmp_path: Path) -> 
     assert found.keypoints[1][:, 0].min() < 100
 
 
-def test_large_sets_are_paired_by_likeness(shot: RenderedShot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_sets_are_paired_by_appearance(
+    shot: RenderedShot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(matches, "EXHAUSTIVE_UP_TO", 2)
-    monkeypatch.setattr(matches, "_WORDS", 64)
+    monkeypatch.setattr(matches, "_VISUAL_WORDS", 64)
     names = write_images(shot, tmp_path / "images")
     found = match_images(tmp_path / "m.db", tmp_path / "images", names, [shot.camera] * 3)
     assert {(p.first, p.second) for p in found.pairs} == {(0, 1), (0, 2), (1, 2)}
