@@ -14,6 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.adjustment.columns import Columns
 from factorsfm.adjustment.elimination import Block, Elimination, Normal, Term, conditioned, reduced
 from factorsfm.adjustment.marginals import Marginals, tangent_basis
 from factorsfm.adjustment.observations import READOUT, Observations, PriorObservations
@@ -47,7 +48,7 @@ class ControlTerm(Protocol):
     @property
     def free(self) -> NDArray[np.bool_]: ...
     def cost(self, state: State) -> float: ...
-    def add(self, state: State, information: Array, gradient: Array, first: int) -> None: ...
+    def add(self, state: State, information: Array, gradient: Array) -> None: ...
 
 
 class BundleAdjustment:
@@ -110,32 +111,26 @@ class BundleAdjustment:
         self._pixels = seen * self._focal(state)[:, None]  # what was measured, whatever the lens
         if lens_sigmas is not None:
             self._pixels += observations.swept(state.lens[READOUT])
-        frames, images, nodes = len(state.rotation), len(state.scale), len(state.field)
-        self._lens = 6 * frames
-        self._shape = self._lens + len(state.log_focal)
-        self._affine = self._shape + (0 if lens_sigmas is None else LENS_SIZE)
-        self._field = self._affine + 2 * images
-        self._control = self._field + nodes
-        self._columns = self._control + len(state.control)
-        free = np.ones(self._columns, bool)
+        self.columns = columns = Columns.of(state)
+        frames = len(state.rotation)
+        free = np.ones(columns.size, bool)
         held = np.arange(frames) == state.world if fixed is None else fixed
         self.held = held | (np.bincount(observations.frame, minlength=frames) == 0)  # nothing says where they are
-        free[: self._lens] = np.repeat(~self.held, 6)
-        free[self._lens : self._shape] = free_focal
-        if lens_sigmas is not None:
-            free[self._shape : self._affine] = lens_sigmas > 0
+        free[columns.poses] = np.repeat(~self.held, 6)
+        free[columns.log_focal] = free_focal
+        free[columns.lens] = lens_sigmas is not None and lens_sigmas > 0
         if control is not None:
-            free[self._control :] = control.free
+            free[columns.control] = control.free
         if not free_translation:
-            free[: self._lens].reshape(-1, 6)[:, 3:] = False
+            free[columns.poses].reshape(-1, 6)[:, 3:] = False
         self._free = np.nonzero(free & (not points_only))[0]
         self._freedom: dict[str, Any] = {
             "free_translation": free_translation, "free_focal": free_focal, "focal_prior": focal_prior,
             "lens_sigmas": lens_sigmas, "lens_mean": self._lens_mean, "fixed": held,
         }  # fmt: skip
         self._lens_is_free = free_focal or lens_sigmas is not None
-        self.free_lens = np.nonzero(free[self._lens : self._affine])[0]  # of log focal lengths and `State.lens`
-        self._elimination = Elimination(self._columns, len(state.bearing))
+        self.free_lens = np.nonzero(free[columns.optics])[0]  # rows among the log focal lengths and `State.lens`
+        self._elimination = Elimination(columns.size, len(state.bearing))
 
     # --- residuals ----------------------------------------------------------------------------------------------
 
@@ -238,12 +233,13 @@ class BundleAdjustment:
         errors = self.track_errors
         weight = np.sqrt(cauchy(residual, self.options.kernel)[1]) if errors is None else errors.root_weight
         gain = np.ascontiguousarray((by_q * weight[:, None, None]).transpose(1, 0, 2))
-        by_camera, columns = by_pose(gain, q, s.inverse_distance[o.point]), 6 * o.frame[:, None] + np.arange(6)
+        by_camera, columns = by_pose(gain, q, s.inverse_distance[o.point]), self.columns.pose(o.frame)
         if self._lens_is_free:
             by_lens = (self._by_lens(residual, q) * weight[:, None, None]).transpose(1, 0, 2)
-            shape = np.broadcast_to(np.arange(self._shape, self._affine), (len(q), self._affine - self._shape))
+            lens = self.columns.lens.start + np.arange(by_lens.shape[2] - 1)
             by_camera = np.concatenate([by_camera, by_lens], 2)
-            columns = np.concatenate([columns, self._lens + self._group[:, None], shape], 1)
+            focal = self.columns.log_focal.start + self._group[:, None]
+            columns = np.concatenate([columns, focal, np.broadcast_to(lens, (len(q), len(lens)))], 1)
         by_bearing = s.rotation[o.frame] @ tangent[o.point]
         by_point = gain.transpose(1, 0, 2) @ np.concatenate([by_bearing, s.translation[o.frame][:, :, None]], 2)
         weighted = (residual * weight[:, None]).T
@@ -269,8 +265,8 @@ class BundleAdjustment:
             by_affine = np.stack([prediction * unit, unit], -1)
             by_field = (s.scale[p.image] * unit)[:, None] * p.node_weights
             by_camera = np.concatenate([by_pose(along_z, q, s.inverse_distance[p.point]), by_affine, by_field], 1)
-            affine = self._affine + 2 * p.image[:, None] + np.arange(2)
-            columns = np.concatenate([6 * p.frame[:, None] + np.arange(6), affine, self._field + p.nodes], 1)
+            affine = self.columns.affines.start + 2 * p.image[:, None] + np.arange(2)
+            columns = np.concatenate([self.columns.pose(p.frame), affine, self.columns.field.start + p.nodes], 1)
             terms.append(
                 Term(
                     (value * weight)[None],
@@ -284,32 +280,31 @@ class BundleAdjustment:
         return terms
 
     def _linearize(self) -> Normal:
-        s = self.state
+        s, columns = self.state, self.columns
         normal = self._elimination.normal_equations(self._terms(), cameras=len(self._free) > 0)
         camera, gradient, point, point_gradient = (
             normal.camera, normal.camera_gradient, normal.point, normal.point_gradient
         )  # fmt: skip
+        diagonal = np.einsum("ii->i", camera)  # a view
         point[:, 2, 2] += 1.0 / self._point_sigma**2
         point_gradient[:, 2] += (s.inverse_distance - self._anchor) / self._point_sigma**2
         if self._focal_prior is not None:
-            focal, (mean, information) = slice(self._lens, self._shape), self._focal_prior
-            camera[focal, focal] += information
-            gradient[focal] += information @ (s.log_focal - mean)
+            mean, information = self._focal_prior
+            camera[columns.log_focal, columns.log_focal] += information
+            gradient[columns.log_focal] += information @ (s.log_focal - mean)
         if self._lens_sigmas is not None:
-            shape = np.arange(self._shape, self._affine)
             difference, information = self._lens_prior(s)
-            camera[shape, shape] += information
-            gradient[shape] += information * difference
+            diagonal[columns.lens] += information
+            gradient[columns.lens] += information * difference
         if (p := self.prior) is not None:
-            affine = np.arange(self._affine, self._field)
-            information = np.tile([p.scale_sigma**-2.0, p.shift_sigma**-2.0], len(s.scale))
-            camera[affine, affine] += information
-            gradient[affine] += information * np.stack([s.scale - 1.0, s.shift], -1).ravel()
-            field = slice(self._field, self._control)
-            camera[field, field] += p.field_information
-            gradient[field] += p.field_information @ s.field
+            diagonal[columns.scales] += p.scale_sigma**-2.0
+            diagonal[columns.shifts] += p.shift_sigma**-2.0
+            gradient[columns.scales] += p.scale_sigma**-2.0 * (s.scale - 1.0)
+            gradient[columns.shifts] += p.shift_sigma**-2.0 * s.shift
+            camera[columns.field, columns.field] += p.field_information
+            gradient[columns.field] += p.field_information @ s.field
         if self.control is not None:
-            self.control.add(s, camera, gradient, self._control)
+            self.control.add(s, camera, gradient)
         return normal
 
     def of(self, rows: NDArray[np.bool_]) -> BundleAdjustment:
@@ -332,7 +327,7 @@ class BundleAdjustment:
         seen = information.diagonal() > 1e-200
         step = np.zeros(len(gradient))
         step[seen] = -np.linalg.solve(information[np.ix_(seen, seen)], gradient[seen])
-        return step[np.searchsorted(self._free, self._lens + self.free_lens)]
+        return np.asarray(step[np.searchsorted(self._free, self.columns.optics.start + self.free_lens)])
 
     def condensed(self) -> tuple[Array, Array]:
         """Information matrix and gradient of the free camera side at the present state, the points eliminated."""
@@ -345,7 +340,7 @@ class BundleAdjustment:
     ) -> tuple[Array, Array]:
         information, gradient, point_covariance = reduced(normal, blocks, damping)
         free = self._free
-        camera = np.zeros(self._columns)
+        camera = np.zeros(self.columns.size)
         camera[free] = solve_cameras(self.state, conditioned(information[np.ix_(free, free)]), gradient[free])
         pull = normal.point_gradient.copy()
         for cross, columns, span in blocks:
@@ -353,10 +348,10 @@ class BundleAdjustment:
         return camera, -np.einsum("nij,nj->ni", point_covariance, pull)
 
     def _retract(self, camera: Array, point: Array) -> State:
-        s = self.state
-        pose = camera[: self._lens].reshape(-1, 6)
+        s, columns = self.state, self.columns
+        pose = camera[columns.poses].reshape(-1, 6)
         turn = exponential(-pose[:, :3])
-        log_focal = camera[self._lens : self._shape]
+        log_focal = camera[columns.log_focal]
         by_lens = float(log_focal[s.group[s.world]])
         # A new focal length moves the points along, so that the world's camera sees them where it did: what the step
         # says of that to first order is done in full. The other focal lengths are relative to that of this camera.
@@ -366,18 +361,17 @@ class BundleAdjustment:
         nearer = point[:, 2] - by_lens * s.inverse_distance * (side**2).sum(1)
         bearing = (s.bearing + np.einsum("nij,nj->ni", tangent, turned)) * stretch
         length = np.linalg.norm(bearing, axis=1)
-        affine = camera[self._affine : self._field].reshape(-1, 2)
         return State(
             rotation=turn @ s.rotation,
             translation=np.einsum("nij,nj->ni", turn, s.translation - pose[:, 3:]),
             bearing=bearing / length[:, None],
             inverse_distance=(s.inverse_distance + nearer) / length,
             log_focal=s.log_focal + log_focal,
-            lens=s.lens if self._lens_sigmas is None else s.lens + camera[self._shape : self._affine],
-            scale=s.scale + affine[:, 0],
-            shift=s.shift + affine[:, 1],
-            control=s.control + camera[self._control :],
-            field=s.field + camera[self._field : self._control],
+            lens=s.lens + camera[columns.lens],
+            scale=s.scale + camera[columns.scales],
+            shift=s.shift + camera[columns.shifts],
+            control=s.control + camera[columns.control],
+            field=s.field + camera[columns.field],
             group=s.group,
             world=s.world,
         )
@@ -413,16 +407,12 @@ class BundleAdjustment:
     # --- uncertainty --------------------------------------------------------------------------------------------
 
     def marginals(self) -> Marginals:
-        """Everything that covariances are made of, at the present state.
-
-        Columns: six per frame in GTSAM's pose convention, log focal lengths, lens, scale and shift per image, field,
-        control; zero where they are fixed.
-        """
+        """Everything that covariances are made of, at the present state; zero for variables that are held."""
         normal = self._linearize()
         blocks = self._elimination.cross_blocks(normal)
         information, _, given_camera = reduced(normal, blocks, 0.0)
         free = self._free
-        camera = np.zeros((self._columns, self._columns))
+        camera = np.zeros((self.columns.size, self.columns.size))
         camera[np.ix_(free, free)] = np.linalg.inv(conditioned(information[np.ix_(free, free)]))
         return Marginals(camera, given_camera, blocks)
 
@@ -435,7 +425,7 @@ class BundleAdjustment:
         blocks = self._elimination.cross_blocks(normal)
         information, _, given_camera = reduced(normal, blocks, 0.0)
         free = self._free
-        gain = np.zeros((self._columns, len(columns)))
+        gain = np.zeros((self.columns.size, len(columns)))
         gain[free] = np.linalg.inv(conditioned(information[np.ix_(free, free)]))[:, np.searchsorted(free, columns)]
         moved = np.zeros((len(self.state.bearing), len(columns)))
         for t in normal.terms:

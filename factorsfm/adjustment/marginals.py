@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.adjustment.columns import Columns
 from factorsfm.adjustment.state import State
 from factorsfm.support.rotations import cross_matrices
 
@@ -19,7 +20,7 @@ class Marginals:
     """Uncertainty of a `BundleAdjustment` whose only held pose is the first.
 
     Attributes:
-        camera: (c, c) covariance of the camera side, columns as in `BundleAdjustment.marginals`.
+        camera: (c, c) covariance of the camera side, see `Columns`.
         point: (n, 3, 3) covariance of each point given the camera side: two tangent directions of the bearing (see
             `tangent_basis`), inverse distance.
         blocks: camera-point blocks of the information matrix with their columns, by span of points.
@@ -70,22 +71,25 @@ class Marginals:
         return np.sqrt(variance)
 
 
-def in_scene_unit(marginals: Marginals, state: State) -> Array:
+def in_scene_unit(marginals: Marginals, state: State, control: Array | None = None) -> Array:
     """Covariance of the camera side relative to the first camera, in the scene's unit of length.
 
-    Only weak priors hold the unit. Here it is the mean inverse distance of the points: the errors are those that
+    Only weak priors determine the unit. Here it is the mean inverse distance of the points: the errors are those that
     remain when a solution is scaled to the true mean.
+
+    Args:
+        control: by how much `State.control` changes with the logarithm of the scene's size; None without control.
     """
-    motion = np.zeros((len(marginals.camera), 1))
-    lens, images = 6 * len(state.rotation), len(state.scale)
-    affine = lens + len(state.log_focal)
-    field = affine + 2 * images
-    motion[:lens, 0].reshape(-1, 6)[:, 3:] = state.translation
-    motion[affine:field:2, 0] = -state.scale
-    motion[field : field + len(state.field), 0] = state.field
+    columns = Columns.of(state)
+    motion = np.zeros(columns.size)
+    motion[columns.poses].reshape(-1, 6)[:, 3:] = state.translation
+    motion[columns.scales] = -state.scale
+    motion[columns.field] = state.field
+    if control is not None:
+        motion[columns.control] = control
     measured = np.zeros((len(state.bearing), 3, 1))
     measured[:, 2] = 1.0 / state.inverse_distance.sum()
-    return marginals.relative(motion, measured)
+    return marginals.relative(motion[:, None], measured)
 
 
 def scene_weights(marginals: Marginals, state: State) -> Array:
@@ -110,13 +114,14 @@ def in_scene(marginals: Marginals, state: State, weights: Array) -> Array:
     normal = np.einsum("nig,nih->gh", weighted, moved)
     measured = np.einsum("nij,nig->njg", by_point, weighted) @ np.linalg.inv(normal)
     centers = -np.einsum("kji,kj->ki", state.rotation, state.translation)
+    poses = Columns.of(state).poses
     motion = np.zeros((len(marginals.camera), 7))
-    pose = motion[: 6 * frames].reshape(frames, 6, 7)
+    pose = motion[poses].reshape(frames, 6, 7)
     pose[:, :3, 3:6] = state.rotation
     pose[:, 3:, :3] = state.rotation
     pose[:, 3:, 3:6] = -state.rotation @ cross_matrices(centers)
     pose[:, 3:, 6] = -state.translation
-    return marginals.relative(motion, measured)[: 6 * frames, : 6 * frames]
+    return marginals.relative(motion, measured)[poses, poses]
 
 
 def tangent_basis(bearing: Array) -> Array:

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.adjustment.columns import Columns
 from factorsfm.adjustment.residuals import by_pose, camera_points, cauchy, reprojection
 from factorsfm.adjustment.state import State
 from factorsfm.support.rotations import cross_matrices
@@ -43,12 +44,11 @@ class View:
 
     Args:
         start: (3, 3) rotation of the datum before `State.control` turns it; anchor: (3,) the position ``a``.
-        first: column of the first variable of the control.
     """
 
-    def __init__(self, state: State, start: Array, anchor: Array, first: int = 0) -> None:
-        self.state = state
-        self.first = first
+    def __init__(self, state: State, start: Array, anchor: Array) -> None:
+        self.state, self.columns = state, Columns.of(state)
+        self.first = int(self.columns.control.start)  # column of the first variable of the datum
         turn, by_vector = cv2.Rodrigues(state.control[:3])
         self.rotation = turn @ start
         self.by_vector = np.asarray(by_vector).reshape(3, 3, 3) @ start  # of the rotation, by the rotation vector
@@ -59,7 +59,7 @@ class View:
         """Position in the world of the polish."""
         if place.camera:
             rotation, translation = self.state.rotation[place.row], self.state.translation[place.row]
-            return -rotation.T @ translation, 6 * place.row + np.arange(3, 6), rotation.T
+            return -rotation.T @ translation, self.columns.pose(place.row)[3:], rotation.T
         offset = DATUM + 3 * place.row
         return self.state.control[offset : offset + 3], self.first + offset + np.arange(3), np.eye(3)
 
@@ -130,7 +130,7 @@ class RotationItem:
         vector = cv2.Rodrigues(off)[0][:, 0]
         by_camera = np.concatenate([np.eye(3), view.state.rotation[self.row] @ view.own_turn], 1)
         derivative = _inverse_right_jacobian(vector) @ by_camera
-        columns = np.append(6 * self.row + np.arange(3), view.first + np.arange(3))
+        columns = np.append(view.columns.pose(self.row)[:3], view.first + np.arange(3))
         sigma = np.radians(self.sigma)
         return vector / sigma, columns, derivative / sigma
 
@@ -154,7 +154,7 @@ class MarkItem:
         residual, by_q = reprojection(q, focal * self.observed[None], focal)
         by_camera = by_pose(by_q[0], q.repeat(2, 0), one.repeat(2))
         derivative = np.concatenate([by_camera, by_q[0] @ s.rotation[self.row]], 1)
-        return residual[0] / self.sigma, np.append(6 * self.row + np.arange(6), columns), derivative / self.sigma
+        return residual[0] / self.sigma, np.append(view.columns.pose(self.row), columns), derivative / self.sigma
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,8 +224,8 @@ class ControlTerm:
         self.free = free
         self._start, self._anchor = start, anchor
 
-    def view(self, state: State, first: int = 0) -> View:
-        return View(state, self._start, self._anchor, first)
+    def view(self, state: State) -> View:
+        return View(state, self._start, self._anchor)
 
     def residuals(self, state: State) -> list[Array]:
         """Of every item, in standard deviations."""
@@ -236,9 +236,9 @@ class ControlTerm:
         """Robust cost."""
         return sum(float(cauchy(r[None], self.kernel)[0][0]) for r in self.residuals(state))
 
-    def add(self, state: State, information: Array, gradient: Array, first: int) -> None:
-        """Add to the normal equations (c, c) and (c,) of a camera side whose control begins at the column `first`."""
-        view = self.view(state, first)
+    def add(self, state: State, information: Array, gradient: Array) -> None:
+        """Add to the normal equations (c, c) and (c,) of the camera side, see `Columns`."""
+        view = self.view(state)
         for item in self.items:
             residual, columns, derivative = item.linearized(view)
             weight = cauchy(residual[None], self.kernel)[1][0]

@@ -10,7 +10,8 @@ import pycolmap
 from numpy.typing import NDArray
 
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
-from factorsfm.adjustment.marginals import Marginals
+from factorsfm.adjustment.columns import Columns
+from factorsfm.adjustment.marginals import Marginals, in_scene_unit
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.state import State
 from factorsfm.control.fit import ControlFit, ControlResidual
@@ -179,9 +180,10 @@ def _described(solved: BundleAdjustment, term: ControlTerm, known: _Known, place
     """The solution with everything that is to be said of it."""
     state, marginals = solved.state, solved.marginals()
     view = term.view(state)
-    relative = _in_scene_unit(marginals, state, view)
+    relative = in_scene_unit(marginals, state, _by_size(state, view))
     covariance = _pose_covariance(marginals, state, view)
-    scale_variance = relative[len(relative) - len(state.control) + 6, len(relative) - len(state.control) + 6]
+    log_scale = Columns.of(state).control.start + 6
+    scale_variance = float(relative[log_scale, log_scale])
     spread = view.scale * np.sqrt(np.trace(covariance[:, 3:, 3:], axis1=1, axis2=2))
     residuals = [_residual(item, r) for item, r in zip(term.items, term.residuals(state), strict=True)]
     logger.info("control: %d items, %d contradict", len(residuals), sum(r.contradicts for r in residuals))
@@ -295,13 +297,12 @@ def _start_places(known: _Known, datum: Similarity) -> Array:
 
 def _with_datum(state: State, term: ControlTerm) -> State:
     """Datum and marked points at their best for the poses as they are (Levenberg-Marquardt)."""
-    first, damping = 6 * len(state.rotation), 1e-4
-    size = first + len(state.control)
+    columns, damping = Columns.of(state), 1e-4
     cost = term.cost(state)
     for _ in range(_DATUM_STEPS):
-        information, gradient = np.zeros((size, size)), np.zeros(size)
-        term.add(state, information, gradient, first)
-        mine = first + np.nonzero(term.free)[0]
+        information, gradient = np.zeros((columns.size, columns.size)), np.zeros(columns.size)
+        term.add(state, information, gradient)
+        mine = columns.control.start + np.nonzero(term.free)[0]
         normal = information[np.ix_(mine, mine)]
         normal[np.diag_indices_from(normal)] *= 1.0 + damping
         normal += 1e-12 * np.eye(len(normal))
@@ -355,7 +356,7 @@ def _pose_covariance(marginals: Marginals, state: State, view: View) -> Array:
 
     A change of the datum turns and moves all cameras: ``R (s x) + T`` by its variables, seen from the camera.
     """
-    frames, first = len(state.rotation), len(marginals.camera) - len(state.control)
+    frames, own = len(state.rotation), Columns.of(state)
     blocks = np.empty((frames, 6, 6))
     for row in range(frames):
         _, _, by_place = view.known_place(Place(row, camera=True))
@@ -364,24 +365,15 @@ def _pose_covariance(marginals: Marginals, state: State, view: View) -> Array:
         derivative[:, :6] = np.eye(6)
         derivative[:3, 6:9] = state.rotation[row] @ view.own_turn
         derivative[3:, 6:] = world_from_cam.T @ by_place[:, 3:] / view.scale
-        columns = np.append(6 * row + np.arange(6), first + np.arange(DATUM))
+        columns = np.append(own.pose(row), own.control.start + np.arange(DATUM))
         blocks[row] = derivative @ marginals.camera[np.ix_(columns, columns)] @ derivative.T
     return blocks
 
 
-def _in_scene_unit(marginals: Marginals, state: State, view: View) -> Array:
-    """As `marginals.in_scene_unit`, with the datum and the marked points carried along."""
-    motion = np.zeros((len(marginals.camera), 1))
-    control = len(motion) - len(state.control)
-    poses = 6 * len(state.rotation)
-    motion[:poses, 0].reshape(-1, 6)[:, 3:] = state.translation
-    affine = poses + len(state.log_focal)
-    field = affine + 2 * len(state.scale)
-    motion[affine:field:2, 0] = -state.scale
-    motion[field:control, 0] = state.field
-    motion[control + 3 : control + 6, 0] = view.scale * view.rotation @ view.anchor
-    motion[control + 6, 0] = 1.0
-    motion[control + DATUM :, 0] = -state.control[DATUM:]
-    measured = np.zeros((len(state.bearing), 3, 1))
-    measured[:, 2] = 1.0 / state.inverse_distance.sum()
-    return marginals.relative(motion, measured)
+def _by_size(state: State, view: View) -> Array:
+    """(7 + 3 p,) by how much datum and marked points change with the logarithm of the scene's size."""
+    by_size = np.zeros(len(state.control))
+    by_size[3:6] = view.scale * view.rotation @ view.anchor
+    by_size[6] = 1.0
+    by_size[DATUM:] = -state.control[DATUM:]
+    return by_size

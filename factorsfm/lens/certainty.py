@@ -42,7 +42,7 @@ def lens_covariances(adjustment: BundleAdjustment) -> list[Array]:
     Errors that are alike for a while, or in a part of the image, or as long as a track lives, count as one. How many
     there are is seen in blocks of residuals, and in how differently the parts of the image, and the tracks, pull.
     """
-    columns = 6 * len(adjustment.state.rotation) + adjustment.free_lens
+    columns = adjustment.columns.optics.start + adjustment.free_lens
     whole = adjustment.marginals().camera
     inflation = block_inflation(adjustment.reprojection_vectors(), adjustment.observations)
     o, influence = adjustment.observations, adjustment.influences(columns)

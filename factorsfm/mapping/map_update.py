@@ -217,7 +217,8 @@ def _better_focal(adjustment: BundleAdjustment, held: NDArray[np.bool_]) -> floa
         sigma=adjustment.sigma, free_focal=True, fixed=held, prior=adjustment.prior,
     )  # fmt: skip
     state = free.solve(_LENS_ITERATIONS)
-    variance = _COVARIANCE_INFLATION * free.marginals().camera[6 * len(held), 6 * len(held)]
+    focal = free.columns.log_focal
+    variance = _COVARIANCE_INFLATION * float(free.marginals().camera[focal, focal].item())
     if variance > _LENS_STD**2 or abs(state.log_focal - adjustment.state.log_focal)[0] > _LARGEST_LENS_STEP:
         return None
     adjustment.state = state

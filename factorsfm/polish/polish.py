@@ -177,16 +177,12 @@ def polish(
             state, observations, final, sigma=scale * wide, free_translation=free, track_errors=errors
         )
     adjustment.solve(o.final_iterations)
-    if prior is not None:
-        prior.residual = adjustment.prior_residuals()
     marginals = adjustment.marginals()
     camera_covariance = in_scene_unit(marginals, adjustment.state)
     observability = camera_observability(adjustment, marginals, camera_covariance)
     k = len(frames)
     if prior is not None:
-        first = 6 * k + len(adjustment.state.log_focal)
-        affine = np.sqrt(camera_covariance.diagonal()[first : first + 2 * len(prior.images)])
-        prior.scale_std, prior.shift_std = affine[::2], affine[1::2]
+        _describe_affines(prior, adjustment, camera_covariance)
     result = Polished(
         frames, adjustment.state, tracks, observations, adjustment.reprojection_errors(), sigma,
         known.motion, pose_blocks(camera_covariance, k), observability,
@@ -231,15 +227,18 @@ def _too_few(count: int, least: int) -> str:
 def _put_under_control(result: Polished, adjustment: BundleAdjustment, control: LocatedControl) -> None:
     """Everything as it is with the control; what carries each camera stays as the images and the prior have it."""
     found = solve_under_control(adjustment, control, result.frames)
-    k = len(result.frames)
     result.state, result.errors = found.adjustment.state, found.adjustment.reprojection_errors()
     result.covariance, result.datum, result.control = found.covariance, found.datum, found.fit
     result.point_std = found.marginals.inverse_distance_std(found.camera_covariance)
     if result.prior is not None:
-        result.prior.residual = found.adjustment.prior_residuals()
-        first = 6 * k + len(result.state.log_focal)
-        affine = np.sqrt(found.camera_covariance.diagonal()[first : first + 2 * len(result.prior.images)])
-        result.prior.scale_std, result.prior.shift_std = affine[::2], affine[1::2]
+        _describe_affines(result.prior, found.adjustment, found.camera_covariance)
+
+
+def _describe_affines(prior: PriorPart, adjustment: BundleAdjustment, camera_covariance: Array) -> None:
+    """What a solution says of the prior: its residuals, and how certain scale and shift of each image are."""
+    std = np.sqrt(camera_covariance.diagonal())
+    prior.residual = adjustment.prior_residuals()
+    prior.scale_std, prior.shift_std = std[adjustment.columns.scales], std[adjustment.columns.shifts]
 
 
 def _fit_to_recorded_images(result: Polished, shutter: Shutter, options: PolishOptions) -> None:

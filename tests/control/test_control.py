@@ -27,6 +27,7 @@ from factorsfm import (
     read_control,
 )
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
+from factorsfm.adjustment.marginals import in_scene_unit
 from factorsfm.adjustment.state import State
 from factorsfm.cli import main as cli
 from factorsfm.control.known import LocatedControl, locate
@@ -41,7 +42,7 @@ from factorsfm.control.residuals import (
     PositionItem,
     RotationItem,
 )
-from factorsfm.control.solve import _in_scene_unit
+from factorsfm.control.solve import _by_size
 from factorsfm.evaluation.readers import read_shot
 from factorsfm.polish.polish import Polished, polish
 from factorsfm.support.similarity import Similarity, align, pose_arrays
@@ -87,17 +88,16 @@ def test_each_residual_has_the_derivative_of_its_value(number: int) -> None:
     problem, state, term = linear_point()
     adjustment = BundleAdjustment(state, problem.observations, PolishOptions(), sigma=1.0, control=term)
     item = term.items[number]
-    first = len(adjustment.marginals().camera) - len(state.control)
-    residual, columns, derivative = item.linearized(term.view(state, first))
+    residual, columns, derivative = item.linearized(term.view(state))
     assert derivative.shape == (len(residual), len(columns))
     numeric = np.zeros_like(derivative)
     for at, column in enumerate(columns):
         values = []
         for sign in (1, -1):
-            step = np.zeros(first + len(state.control))
+            step = np.zeros(adjustment.columns.size)
             step[column] = sign * 1e-6
             moved = adjustment._retract(step, np.zeros((len(state.bearing), 3)))
-            values.append(item.linearized(term.view(moved, first))[0])
+            values.append(item.linearized(term.view(moved))[0])
         numeric[:, at] = (values[0] - values[1]) / 2e-6
     np.testing.assert_allclose(derivative, numeric, rtol=1e-5, atol=1e-6 * np.abs(numeric).max())
     assert (np.abs(numeric).max(axis=0) > 1e-4).all()  # every column takes part
@@ -108,14 +108,14 @@ def test_the_gradient_of_the_adjustment_is_that_of_its_cost() -> None:
     adjustment = BundleAdjustment(state, problem.observations, PolishOptions(), sigma=0.5, control=term)
     normal = adjustment._linearize()
     n, size = len(state.bearing), len(normal.camera_gradient)
-    assert size == 6 * 5 + 2 + DATUM + 9
+    assert size == 6 * 5 + 2 + 6 + DATUM + 9
     numeric = np.zeros(size)
     for column in range(size):
         step = np.zeros(size)
         step[column] = 1e-6
         costs = [adjustment._cost(adjustment._retract(sign * step, np.zeros((n, 3)))) for sign in (1, -1)]
         numeric[column] = (costs[0] - costs[1]) / 2e-6
-    varied = np.setdiff1d(np.arange(size), [6 * 5, 6 * 5 + 1])  # the focal lengths are settled before
+    varied = np.delete(np.arange(size), adjustment.columns.optics)  # the lens is settled before
     found, numeric = normal.camera_gradient[varied], numeric[varied]
     np.testing.assert_allclose(found, numeric, rtol=1e-5, atol=1e-5 * np.abs(numeric).max())
 
@@ -131,7 +131,7 @@ def test_the_control_does_not_know_the_unit_of_the_polish() -> None:
         return motion
 
     marginals = SimpleNamespace(camera=adjustment.marginals().camera, relative=relative)
-    _in_scene_unit(marginals, state, term.view(state))  # type: ignore[arg-type]
+    in_scene_unit(marginals, state, _by_size(state, term.view(state)))  # type: ignore[arg-type]
     before = term.residuals(state)
     moved = adjustment._retract(1e-4 * seen["motion"], np.zeros((len(state.bearing), 3)))
     for old, new in zip(before, term.residuals(moved), strict=True):
