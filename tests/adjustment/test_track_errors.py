@@ -64,7 +64,7 @@ def problem_with_persistent_errors(shot, size, seed=0):
 def test_the_gradient_is_that_of_the_cost(shot):
     adjustment = problem_with_persistent_errors(shot, 0.3)
     normal, step = adjustment._linearize(), 1e-6
-    cameras, points = np.zeros(adjustment._columns), np.zeros((len(shot.points), 3))
+    cameras, points = np.zeros(adjustment.columns.size), np.zeros((len(shot.points), 3))
     for column in (6, 9, 100, 200, 238):
         cameras[column] = step
         costs = [adjustment._cost(adjustment._retract(sign * cameras, points)) for sign in (1.0, -1.0)]
@@ -81,7 +81,7 @@ def test_the_gradient_is_that_of_the_cost(shot):
 def test_the_normal_equations_are_those_of_the_dense_information_matrix(shot):
     adjustment = problem_with_persistent_errors(shot, 0.3)
     errors, normal = adjustment.track_errors, adjustment._linearize()
-    term, c = normal.terms[0], adjustment._columns
+    term, c = normal.terms[0], adjustment.columns.size
     m = len(term.point)
     jacobian = np.zeros((2, m, c + 3 * len(shot.points)))
     for k in range(m):

@@ -13,8 +13,9 @@ from factorsfm.adjustment.observations import Observations, Sweep
 from factorsfm.adjustment.residuals import distort
 from factorsfm.adjustment.state import LENS_SIZE
 from factorsfm.camera.guess import guess_camera
-from factorsfm.camera.projection import PIXEL_CENTER, lens_shape, normalized_from_pixels, with_lens
+from factorsfm.camera.projection import PIXEL_CENTER, normalized_from_pixels
 from factorsfm.cli.main import main
+from factorsfm.lens.camera_model import distortion_of, with_distortion
 from factorsfm.lens.certainty import _left_out_covariance, lens_covariances
 from factorsfm.lens.estimate import _solved_as_it_moves, solved_with_lens
 from factorsfm.lens.lens import Lens, renormalized, through, undistort
@@ -345,12 +346,12 @@ def test_distortion_alone_is_recovered_and_the_focal_length_stays_as_given():
 def test_a_camera_of_the_lens_sees_as_the_lens_does():
     guess = guess_camera(960, 540)
     shape = np.array([-0.1, 0.03, 0.01, -0.02])
-    camera = with_lens(guess, 800.0, shape)
+    camera = with_distortion(guess, 800.0, shape)
     assert camera.model_name == "RADIAL"
     uv = np.array([[0.1, 0.2], [-0.4, 0.15]])
     pixels = 800.0 * distort(uv, shape)[0] + [480 - PIXEL_CENTER, 270 - PIXEL_CENTER]
     np.testing.assert_allclose(normalized_from_pixels(camera, pixels), uv, atol=1e-8)
-    np.testing.assert_allclose(lens_shape(camera), [-0.1, 0.03, 0, 0])
+    np.testing.assert_allclose(distortion_of(camera), [-0.1, 0.03, 0, 0])
 
 
 def test_a_lens_that_cannot_be_estimated_is_refused():
@@ -358,7 +359,7 @@ def test_a_lens_that_cannot_be_estimated_is_refused():
         camera_id=1, model="OPENCV_FISHEYE", width=64, height=64, params=[50, 50, 32, 32, 0, 0, 0, 0]
     )
     with pytest.raises(InputError, match="OPENCV_FISHEYE"):
-        lens_shape(fisheye)
+        distortion_of(fisheye)
     with pytest.raises(InputError, match="unknown lens 'wide'"):
         api.reconstruct([], lens="wide")
 
