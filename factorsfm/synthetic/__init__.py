@@ -1,6 +1,6 @@
-"""Synthetic shots with exact truth: projected points, and a rendered room with video, depth and poses.
+"""Synthetic shots with exact truth: projected points, and a rendered room.
 
-Takes a motion, gives frames with their truth. May import `camera` and what lies below it.
+Takes a camera motion, gives observations or images with poses and depth. May import `camera` and what lies below it.
 """
 
 from factorsfm.synthetic.rolling import read_by_rows

@@ -1,4 +1,4 @@
-"""A textured room with boxes, met by rays: images and exact depth."""
+"""A textured room with boxes, rendered by ray casting: images and exact depth."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from factorsfm.synthetic.scene import FIELD_OF_VIEW, Floats
 
 
 class Room:
-    """The room between 2 and 7 units in front of the identity; it has no wall behind it.
+    """A room with boxes, 2 to 7 units in front of a camera at the identity; it has no wall behind that camera.
 
     Args:
         seed: of the boxes and their textures.
-        focal_length: pixels; the textures are about as fine as an image of it.
+        focal_length: pixels; an image with it resolves about one texel per pixel.
     """
 
     def __init__(self, seed: int, focal_length: float) -> None:
@@ -28,17 +28,17 @@ class Room:
         ]
 
     def depth(self, camera: pycolmap.Camera, pose: pycolmap.Rigid3d) -> Floats:
-        """(h, w) exact z-depth at the pixel centres, world units."""
+        """(h, w) exact z-depth at the pixel centres, world units; `pose` is cam_from_world."""
         return np.asarray(1 / _cast(self._quads, camera, pose, 1).inverse_depth, np.float64)
 
     def image(self, camera: pycolmap.Camera, pose: pycolmap.Rigid3d) -> NDArray[np.uint8]:
-        """(h, w, 3) BGR, two by two samples per pixel, averaged."""
+        """(h, w, 3) BGR, the mean of two by two samples per pixel; `pose` is cam_from_world."""
         return _render(self._quads, self._textures, camera, pose)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Quad:
-    """The parallelogram origin + u * edges[0] + v * edges[1], u and v from 0 to 1, and its brightness."""
+    """A parallelogram: ``origin + u * edges[0] + v * edges[1]``, u and v from 0 to 1; `shade` scales its brightness."""
 
     origin: Floats
     edges: Floats
@@ -47,7 +47,13 @@ class _Quad:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Hits:
-    """What the rays of an image hit: row in the list of quads, place on the quad (u, v), 1 / z."""
+    """What the rays of the pixels of an image hit.
+
+    Attributes:
+        quad: (h, w) position in the list of quads.
+        uv: (2, h, w) place on the quad.
+        inverse_depth: (h, w) 1 / z.
+    """
 
     quad: NDArray[np.int16]
     uv: NDArray[np.floating]
@@ -65,11 +71,11 @@ def _quads(generator: np.random.Generator) -> list[_Quad]:
         _Quad(corner, np.array([z, y]), 0.8),
         _Quad(corner + x, np.array([z, y]), 0.75),
     ]
-    for i, depth in enumerate(np.linspace(2.8, 6.2, 9)):  # standing on the floor, left and right in turn
+    for i, depth in enumerate(np.linspace(2.8, 6.2, 9)):  # boxes on the floor, right and left in turn
         size = generator.uniform([0.4, 0.6, 0.4], [0.8, 1.5, 0.8]) * [depth / 5, 1, depth / 5]
         middle = (-1) ** i * generator.uniform(0.15, 0.6) * depth * np.tan(FIELD_OF_VIEW / 2)
         quads += _box(generator, np.array([np.clip(middle, -1.7, 1.7), floor - size[1] / 2, depth]), size)
-    for depth in np.linspace(3.2, 5.7, 4):  # hanging from the ceiling
+    for depth in np.linspace(3.2, 5.7, 4):  # boxes at the ceiling
         size = generator.uniform([0.3, 0.3, 0.3], [0.7, 0.7, 0.7])
         middle = generator.uniform(-0.8, 0.8) * depth * np.tan(FIELD_OF_VIEW / 2)
         quads += _box(generator, np.array([np.clip(middle, -1.7, 1.7), ceiling + size[1] / 2, depth]), size)
@@ -77,7 +83,7 @@ def _quads(generator: np.random.Generator) -> list[_Quad]:
 
 
 def _box(generator: np.random.Generator, center: Floats, size: Floats) -> list[_Quad]:
-    """The six faces of a box that is turned about the vertical by up to 40 degrees."""
+    """The six faces of a box, rotated about the vertical by up to 40 degrees."""
     turn = np.radians(generator.uniform(-40, 40))
     x, y, z = pycolmap.Rotation3d(np.array([0, turn, 0])).matrix().T * size[:, None]
     corner = center - (x + y + z) / 2
@@ -90,8 +96,8 @@ def _box(generator: np.random.Generator, center: Floats, size: Floats) -> list[_
 
 
 def _cast(quads: list[_Quad], camera: pycolmap.Camera, pose: pycolmap.Rigid3d, oversampling: int) -> _Hits:
-    """Meet every pixel's ray with the nearest quad; exact, since u/z, v/z and 1/z are linear in the pixel."""
-    dtype = np.float64 if oversampling == 1 else np.float32  # depth is truth, colour is not
+    """The nearest quad on the ray of every pixel; exact, because u/z, v/z and 1/z are linear in the pixel."""
+    dtype = np.float64 if oversampling == 1 else np.float32  # depth must be exact, colours need not
     width, height = oversampling * camera.width, oversampling * camera.height
     focal_length = oversampling * camera.focal_length_x
     x = ((np.arange(width) + PIXEL_CENTER - width / 2) / focal_length).astype(dtype)
@@ -110,7 +116,7 @@ def _cast(quads: list[_Quad], camera: pycolmap.Camera, pose: pycolmap.Rigid3d, o
             window = np.s_[rows, columns]
         on_quad = np.linalg.inv(np.column_stack([pose.rotation.matrix() @ quad.edges.T, pose * quad.origin]))
         u, v, w = (row[0] * x[window[1]] + (row[1] * y[window[0]] + row[2]) for row in on_quad.astype(dtype))
-        seam = 1e-6  # neighbours overlap by this much: no ray slips through a corner of the room
+        seam = 1e-6  # overlap of neighbouring quads, so that no ray passes between them
         hit = (w > nearest[2][window]) & (u >= -seam) & (u <= w + seam) & (v >= -seam) & (v <= w + seam)
         hit_quad[window][hit] = i
         for old, new in zip(nearest, (u, v, w), strict=True):
@@ -135,7 +141,7 @@ def _render(
 
 
 def _texture(generator: np.random.Generator, quad: _Quad, focal_length: float) -> NDArray[np.uint8]:
-    """Bricks, blotches with sharp edges, noise of all sizes; about one texel per pixel of the first image."""
+    """(height, width, 3) bricks, blotches with sharp edges and noise of all sizes; about one texel per pixel."""
     middle = quad.origin + quad.edges.sum(axis=0) / 2
     length = np.linalg.norm(quad.edges, axis=1)
     seen = np.linalg.norm(quad.edges[:, :2] - quad.edges[:, 2:] * middle[:2] / middle[2], axis=1)
@@ -162,7 +168,12 @@ def _texture(generator: np.random.Generator, quad: _Quad, focal_length: float) -
 def _noise(
     generator: np.random.Generator, length: Floats, width: int, height: int, coarsest: float, finest: float
 ) -> Floats:
-    """Noise of zero mean and unit deviation; wavelengths in world units, at least three texels."""
+    """(height, width) noise of mean 0 and standard deviation 1, the sum of octaves.
+
+    Args:
+        length: (2,) extent of the texture in world units.
+        coarsest, finest: wavelengths of the first and last octave, in world units; at least three texels.
+    """
     total = np.zeros((height, width))
     wavelength = coarsest
     while wavelength >= max(finest, 3 * max(length[0] / width, length[1] / height)) or wavelength == coarsest:

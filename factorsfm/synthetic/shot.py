@@ -1,4 +1,4 @@
-"""A rendered shot with exact truth: images, depth and poses, with a prior as a network would give it."""
+"""A rendered shot with exact truth: images, depth and poses; and a depth prior with the errors of a network."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ class RenderedShot:
         images: (h, w, 3) uint8 BGR per frame.
         depths: (h, w) float32 per frame: exact z-depth at the pixel centres, world units.
         camera: the lens of the first frame.
-        cam_from_world: one pose per frame.
-        zoom: (k,) focal length of each frame, relative to the first one.
+        cam_from_world: the pose of each frame.
+        zoom: (k,) focal length of each frame over that of the first one.
     """
 
     images: list[NDArray[np.uint8]]
@@ -59,9 +59,9 @@ def render_shot(
         width, height: pixels.
         parallax: largest distance of a camera from the first one over the median depth of the first image,
             exact; beyond about 0.3 the camera may run into a box.
-        seed: of the room, its textures and the handheld sway.
-        zoom: focal length of the last frame over that of the first; between them it changes softly.
-        readout: of a rolling shutter, see `read_by_rows`; poses and depths are those of the middle of the image.
+        seed: of the room, its textures and the handheld path.
+        zoom: focal length of the last frame over that of the first one; it changes smoothly between them.
+        readout: that of a rolling shutter, see `read_by_rows`; poses and depths are those of the middle row.
 
     Raises:
         InputError: an unknown motion, fewer than 2 frames, a parallax outside 0 to 1, or a zoom that is not positive.
@@ -93,11 +93,11 @@ def render_shot(
 def render_views(
     cam_from_world: Iterable[pycolmap.Rigid3d], width: int, height: int, seed: int = 0
 ) -> Iterator[NDArray[np.uint8]]:
-    """The room of `render_shot` from any cameras in it, as (h, w, 3) BGR, one after the other.
+    """Render the room of `render_shot` with its lens from any poses: (h, w, 3) BGR images, one by one.
 
     Args:
-        cam_from_world: the cameras; the room has no wall behind that of the identity.
-        width, height, seed: see `render_shot`, whose lens it is.
+        cam_from_world: the poses; the room has no wall behind a camera at the identity.
+        width, height, seed: as in `render_shot`.
     """
     camera = room_camera(width, height)
     room = Room(seed, camera.focal_length_x)
@@ -106,35 +106,34 @@ def render_views(
 
 
 def simulate_prior(shot: RenderedShot, error: float = 0.05, seed: int = 0) -> list[NDArray[np.float32]]:
-    """Inverse depth as a good network gives it: relative, (h, w) float32 per frame, larger is nearer.
+    """Relative inverse depth with the errors of a good network, (h, w) float32 per frame; larger is nearer.
 
-    Every frame has a scale (20 % spread) and a shift (10 to 20 % of the range of inverse depths) of its own.
-    The error is smooth over the image; half of its variance stays over the shot, half changes slowly.
+    Every frame has its own scale (20 % spread) and shift (10 to 20 % of the range of inverse depths). The error is
+    smooth over the image; half of its variance is constant over the shot, the other half changes within a second.
 
     Args:
-        shot: gives the true depth.
-        error: standard deviation of the error as a fraction of the inverse depth.
-        seed: of everything random.
+        shot: the shot with its true depth.
+        error: standard deviation of the error, as a fraction of the inverse depth.
+        seed: of scales, shifts and errors.
     """
     generator = np.random.default_rng([seed, 2])
     height, width = shot.depths[0].shape
     fixed, changing = (_smooth_field(generator, height, width) for _ in range(2))
-    memory = np.exp(-1 / FRAMES_PER_SECOND)
+    kept = np.exp(-1 / FRAMES_PER_SECOND)  # correlation of the changing error from frame to frame
     priors = []
     for depth in shot.depths:
         inverse = np.exp(error * (fixed + changing) / np.sqrt(2)) / depth
         scale = np.exp(0.2 * generator.standard_normal())
         shift = generator.uniform(0.1, 0.2) * np.ptp(np.percentile(inverse, [2, 98]))
         priors.append((scale * (inverse + shift)).astype(np.float32))
-        fresh = _smooth_field(generator, height, width)
-        changing = memory * changing + np.sqrt(1 - memory**2) * fresh
+        changing = kept * changing + np.sqrt(1 - kept**2) * _smooth_field(generator, height, width)
     return priors
 
 
 def write_shot(shot: RenderedShot, folder: str | Path) -> None:
     """Write ``shot.mp4``, ``depth/%06d.npy`` (`simulate_prior`), ``camera.json`` and ``groundtruth.txt``.
 
-    The lines of ``groundtruth.txt`` are ``frame tx ty tz qx qy qz qw``, camera-to-world.
+    The lines of ``groundtruth.txt`` are ``frame tx ty tz qx qy qz qw``, world_from_cam.
 
     Raises:
         InputError: the folder cannot be written or OpenCV cannot encode the video.
@@ -167,7 +166,7 @@ def write_shot(shot: RenderedShot, folder: str | Path) -> None:
 
 
 def _smooth_field(generator: np.random.Generator, height: int, width: int) -> Floats:
-    """(height, width) of zero mean and unit deviation, correlated over about a quarter of the image."""
+    """(height, width) random field of mean 0 and standard deviation 1, correlated over about a quarter of the image."""
     coarse = generator.standard_normal((6, 8))
     field = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
     return np.asarray((field - field.mean()) / field.std())
