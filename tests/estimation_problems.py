@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pycolmap
 
-from factorsfm.adjustment.observations import Observations
+from factorsfm.adjustment.observations import Observations, PriorObservations
 from factorsfm.adjustment.state import State
 from factorsfm.camera.projection import normalized_from_pixels, pixels_from_normalized
 from factorsfm.mapping.mapped_images import MappedImage
@@ -13,6 +13,8 @@ from factorsfm.priors.image_depth import ImageDepth
 from factorsfm.support.status import FrameStatus
 from factorsfm.synthetic import synthetic_scene
 from factorsfm.tracks.image_tracks import ImageTracks
+
+FIELD = (4, 3)  # columns and rows of the nodes of the smooth field of a prior
 
 
 @dataclass(frozen=True)
@@ -121,3 +123,30 @@ def angles_between(a, b):
 
 def centers(rotation, translation):
     return -np.einsum("kji,kj->ki", rotation, translation)
+
+
+def with_prior(problem, images, *, noise=0.05, smooth=0.0, scale_std=0.15, shift_std=0.08, seed=0):
+    """A prior on some frames, drawn from its own model: the values, and the truth that carries its variables."""
+    rng = np.random.default_rng([seed, 3])
+    truth, n, k = problem.truth, len(problem.points), len(images)
+    columns, rows = FIELD
+    low, high = truth.bearing[:, :2].min(0), truth.bearing[:, :2].max(0)
+    position = (truth.bearing[:, :2] - low) / (high - low) * [columns - 1.001, rows - 1.001]
+    cell, (x, y) = position.astype(int), (position % 1).T
+    nodes = (cell[:, 1] * columns + cell[:, 0])[:, None] + [0, 1, columns, columns + 1]
+    weights = np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], -1)
+    grid = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), -1).reshape(-1, 2)
+    near = np.exp(-np.linalg.norm(grid[:, None] - grid[None], axis=2) / 2) + 1e-6 * np.eye(columns * rows)
+    covariance = max(smooth, 1e-3) ** 2 * near
+    field = np.linalg.cholesky(covariance) @ rng.standard_normal(len(covariance)) * (smooth > 0)
+    scale, shift = 1 + scale_std * rng.standard_normal(k), shift_std * rng.standard_normal(k)
+    image, point = np.tile(np.arange(k), n), np.repeat(np.arange(n), k)
+    frame = np.asarray(images)[image]
+    inverse = truth.inverse_distance[point] / truth.camera_points(frame, point)[:, 2]
+    error = (field[nodes] * weights).sum(1)[point]
+    value = scale[image] * (inverse + error) + shift[image] + noise * rng.standard_normal(n * k)
+    prior = PriorObservations(
+        image, frame, point, value, np.full(n * k, max(noise, 1e-3)), nodes[point], weights[point],
+        np.linalg.inv(covariance), scale_std, shift_std,
+    )  # fmt: skip
+    return prior, replace(truth, scale=scale, shift=shift, field=field)

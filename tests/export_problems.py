@@ -9,7 +9,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from factorsfm.result.reconstruction import Reconstruction
-from tests.export.test_export import build
+from tests.exact_result import build
 
 Array = NDArray[np.float64]
 

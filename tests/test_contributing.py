@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.test_readme import ALL_PAGES, CONTRIBUTING, ROOT, table, text_of
+from tests.pages import ALL_PAGES, CONTRIBUTING, ROOT, table, text_of
 
 FILE = r"`((?:factorsfm|benchmarks)/[\w/]+\.py)`"
 

@@ -21,12 +21,9 @@ from factorsfm.cli import main as cli
 from factorsfm.export import FORMATS
 from factorsfm.priors import models
 from factorsfm.synthetic import render_shot, write_shot
-from tests.priors.test_models import save_network
+from tests.networks import save_network
+from tests.pages import ALL_PAGES, CONTRIBUTING, DOCS, PAGES, README, ROOT, rows, table, text_of
 
-ROOT = Path(__file__).resolve().parents[1]
-README, CONTRIBUTING, DOCS = ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "docs"
-PAGES = [README, *sorted(DOCS.glob("*.md"))]
-ALL_PAGES = [*PAGES, CONTRIBUTING, ROOT / "CHANGELOG.md", ROOT / "benchmarks" / "README.md"]
 # The pages whose tables describe the options of each command.
 DESCRIBED = {
     "reconstruct": ["command-line.md"],
@@ -53,10 +50,6 @@ class Block:
     line: int
 
 
-def text_of(page: Path) -> str:
-    return page.read_text(encoding="utf-8")
-
-
 def blocks(page: Path) -> list[Block]:
     text = text_of(page)
     return [
@@ -69,20 +62,6 @@ def each(language: str) -> pytest.MarkDecorator:
     found = [block for page in PAGES for block in blocks(page) if block.language == language]
     assert found
     return pytest.mark.parametrize("block", [pytest.param(b, id=f"{b.page.name} line {b.line}") for b in found])
-
-
-def rows(text: str) -> list[list[str]]:
-    """The cells of all table rows."""
-    lines = re.findall(r"^\| ?(.*) \|$", text, re.MULTILINE)
-    return [[cell.strip().replace("\\|", "|") for cell in re.split(r"(?<!\\)\|", line)] for line in lines]
-
-
-def table(text: str, first_column: str) -> list[dict[str, str]]:
-    """The rows of the first table whose first column has this name, by column."""
-    body = re.search(rf"^\| {re.escape(first_column)} \|.*\n\|[-:| ]+\|\n((?:\|.*\n)*)", text, re.MULTILINE)
-    assert body, first_column
-    names, *_ = rows(body[0])
-    return [dict(zip(names, row, strict=True)) for row in rows(body[1])]
 
 
 # --- examples ---------------------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ import pytest
 from gtsam.symbol_shorthand import A, L, T, X
 
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment, _newton_step
-from factorsfm.adjustment.observations import Observations, PriorObservations
+from factorsfm.adjustment.observations import Observations
 from factorsfm.graph.factors import (
     affine_of_native,
     camera_from_pose,
@@ -17,38 +17,11 @@ from factorsfm.graph.factors import (
     virtual_offset,
 )
 from factorsfm.support.options import PolishOptions
-from tests.estimation_problems import angles_between, in_unit_of, make_problem, perturbed
+from tests.calibration import assert_calibrated, normalised, pose_errors, without_unit
+from tests.estimation_problems import FIELD, angles_between, in_unit_of, make_problem, perturbed, with_prior
 
 # A tight tolerance and hardly any prior on the points: the optimum is that of the reprojections (and the prior).
 EXACT = PolishOptions(iterations=60, tolerance=1e-12, point_sigma=1e3)
-FIELD = (4, 3)  # columns and rows of the nodes of the smooth field in these tests
-
-
-def with_prior(problem, images, *, noise=0.05, smooth=0.0, scale_std=0.15, shift_std=0.08, seed=0):
-    """A prior on some frames, drawn from its own model: the values, and the truth that carries its variables."""
-    rng = np.random.default_rng([seed, 3])
-    truth, n, k = problem.truth, len(problem.points), len(images)
-    columns, rows = FIELD
-    low, high = truth.bearing[:, :2].min(0), truth.bearing[:, :2].max(0)
-    position = (truth.bearing[:, :2] - low) / (high - low) * [columns - 1.001, rows - 1.001]
-    cell, (x, y) = position.astype(int), (position % 1).T
-    nodes = (cell[:, 1] * columns + cell[:, 0])[:, None] + [0, 1, columns, columns + 1]
-    weights = np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], -1)
-    grid = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), -1).reshape(-1, 2)
-    near = np.exp(-np.linalg.norm(grid[:, None] - grid[None], axis=2) / 2) + 1e-6 * np.eye(columns * rows)
-    covariance = max(smooth, 1e-3) ** 2 * near
-    field = np.linalg.cholesky(covariance) @ rng.standard_normal(len(covariance)) * (smooth > 0)
-    scale, shift = 1 + scale_std * rng.standard_normal(k), shift_std * rng.standard_normal(k)
-    image, point = np.tile(np.arange(k), n), np.repeat(np.arange(n), k)
-    frame = np.asarray(images)[image]
-    inverse = truth.inverse_distance[point] / truth.camera_points(frame, point)[:, 2]
-    error = (field[nodes] * weights).sum(1)[point]
-    value = scale[image] * (inverse + error) + shift[image] + noise * rng.standard_normal(n * k)
-    prior = PriorObservations(
-        image, frame, point, value, np.full(n * k, max(noise, 1e-3)), nodes[point], weights[point],
-        np.linalg.inv(covariance), scale_std, shift_std,
-    )  # fmt: skip
-    return prior, replace(truth, scale=scale, shift=shift, field=field)
 
 
 def start_of(truth, seed=0, **how_far):
@@ -344,33 +317,6 @@ def test_unsorted_observations_are_refused():
 # --- uncertainty ------------------------------------------------------------------------------------------------
 
 TRIALS = 60
-
-
-def pose_errors(state, truth):
-    """(6 (k - 1),) errors of all cameras but the first, which is the world, in the convention of the covariance."""
-    errors = []
-    for k in range(1, len(truth.rotation)):
-        estimate = pose_from_camera(state.rotation[k], state.translation[k])
-        errors.append(estimate.localCoordinates(pose_from_camera(truth.rotation[k], truth.translation[k])))
-    return np.concatenate(errors)
-
-
-def normalised(error, covariance):
-    """Squared error in standard deviations, and its degrees of freedom."""
-    return error @ np.linalg.solve(covariance, error), len(error)
-
-
-def without_unit(error, covariance, direction):
-    """Error and covariance on the complement of the direction in which the unit of length is free."""
-    basis = np.linalg.svd(direction[None])[2][1:]
-    return basis @ error, basis @ covariance @ basis.T
-
-
-def assert_calibrated(trials, low=1.0, high=1.0):
-    """The normalised errors of all trials together are a chi-square draw, up to a factor from `low` to `high`."""
-    total, freedom = np.sum(trials, axis=0)
-    margin = 3.3 * np.sqrt(2 / freedom)  # 99.9 % of a chi-square of many degrees of freedom, relative
-    assert low * (1 - margin) < total / freedom < high * (1 + margin)
 
 
 def test_the_covariance_is_calibrated():

@@ -13,7 +13,7 @@ from factorsfm.batch.outcome import Outcome
 from factorsfm.batch.plan import Job, Method, Video
 from factorsfm.report.result_folder import write_folder
 from factorsfm.support.errors import InputError
-from tests.export.test_export import build
+from tests.exact_result import build
 
 OTHER_VALUES = [None, True, -1, 0.5, "x", [], {}, [[1]], [[5, 2, 0]], {"x": 1}, 10**400]
 

@@ -10,6 +10,7 @@ from factorsfm.camera.files import camera_to_json, check_camera, open_camera, re
 from factorsfm.camera.guess import guess_camera
 from factorsfm.camera.projection import normalized_from_pixels, pixels_from_normalized
 from factorsfm.support.errors import InputError
+from tests.image_files import jpeg_with_focal_length
 
 PLAIN = {"width": 640, "height": 480, "fx": 500.0, "fy": 510.0, "cx": 319.5, "cy": 239.5}
 LENSES = {
@@ -142,17 +143,6 @@ def test_guess_without_exif_spans_50_degrees(width, height):
     assert not camera.has_prior_focal_length
     assert camera.params[1:].tolist() == [width / 2, height / 2]
     assert math.degrees(2 * math.atan(960 / camera.params[0])) == pytest.approx(50, abs=1e-9)
-
-
-def jpeg_with_focal_length(path, equivalent_mm: int):
-    """A 480x270 JPEG whose EXIF holds FocalLengthIn35mmFilm."""
-    cv2.imwrite(str(path), np.full((270, 480, 3), 90, np.uint8))
-    entry = b"\xa4\x05\0\x03\0\0\0\x01" + equivalent_mm.to_bytes(2, "big") + b"\0\0"
-    pointer = b"\x87\x69\0\x04\0\0\0\x01" + (26).to_bytes(4, "big")
-    exif = b"Exif\0\0MM\0*\0\0\0\x08" + b"\0\x01" + pointer + b"\0\0\0\0" + b"\0\x01" + entry + b"\0\0\0\0"
-    jpeg = path.read_bytes()
-    path.write_bytes(jpeg[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + jpeg[2:])
-    return path
 
 
 @pytest.mark.parametrize("size", [(480, 270), (270, 480), (960, 540)])

@@ -13,7 +13,7 @@ from factorsfm.cli import demo
 from factorsfm.cli.main import main
 from factorsfm.evaluation.metrics import TrajectoryErrors
 from factorsfm.support.errors import InputError, ReconstructionError
-from tests.export.test_export import build
+from tests.exact_result import build
 
 CAMERA = {"width": 640, "height": 480, "fx": 500, "fy": 500, "cx": 319.5, "cy": 239.5}
 

@@ -26,6 +26,7 @@ from tests.export_problems import (
     seen_points,
     true_world_from_film,
 )
+from tests.exported_files import after_effects_tracks, nuke_curves, nuke_nodes
 
 Array = NDArray[np.float64]
 
@@ -173,22 +174,6 @@ def nuke_rotation(x: float, y: float, z: float) -> Array:
     return degrees_about(1, y) @ degrees_about(0, x) @ degrees_about(2, z)
 
 
-def nuke_nodes(text: str) -> dict[str, dict[str, str]]:
-    """Knobs of the nodes by name."""
-    nodes = {}
-    for kind, body in re.findall(r"^(\w+) \{\n(.*?)^\}$", text, re.MULTILINE | re.DOTALL):
-        knobs = dict(line[1:].split(" ", 1) for line in body.splitlines())
-        nodes[knobs.get("name", kind)] = {"class": kind, **knobs}
-    return nodes
-
-
-def nuke_curves(knob: str) -> dict[int, list[float]]:
-    curves = [re.findall(r"x(-?\d+) (\S+)", curve) for curve in re.findall(r"\{curve ([^}]*)\}", knob)]
-    keys = [[int(frame) for frame, _ in curve] for curve in curves]
-    assert all(frames == keys[0] for frames in keys)
-    return {frame: [float(curve[i][1]) for curve in curves] for i, frame in enumerate(keys[0])}
-
-
 def test_nuke_script_projects_as_pycolmap(tmp_path: Path) -> None:
     reconstruction = hard_reconstruction()
     options = ExportOptions(scale=HAND, sensor_width=24.89, fps=25, first_frame=101)
@@ -285,21 +270,6 @@ def test_nuke_points_are_the_middles_of_the_tetrahedra(tmp_path: Path) -> None:
 
 # After Effects: y down, z into the picture, orientation about z first, then y, then x, all right-handed in these
 # axes; a camera of zoom z shows at distance z everything at 100 percent, in the middle of the composition.
-
-
-def after_effects_tracks(text: str) -> tuple[dict[str, str], dict[str, dict[int, list[float]]]]:
-    lines = text.split("\n")
-    assert lines[0] == "Adobe After Effects 8.0 Keyframe Data"
-    assert lines[-2] == "End of Keyframe Data"
-    header = dict(line[1:].split("\t") for line in lines[2:7])
-    tracks: dict[str, dict[int, list[float]]] = {}
-    for line in lines[8:-2]:
-        if line and not line.startswith("\t"):
-            tracks[line] = current = {}
-        elif line.startswith("\t") and not line.startswith("\tFrame"):
-            frame, *values = line.strip("\t").split("\t")
-            current[int(frame)] = [float(value) for value in values]
-    return header, tracks
 
 
 def test_after_effects_projects_as_pycolmap(tmp_path: Path) -> None:

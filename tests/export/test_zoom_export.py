@@ -19,8 +19,8 @@ from factorsfm.report.page import report_html
 from factorsfm.result.reconstruction import Reconstruction
 from factorsfm.support.errors import InputError
 from factorsfm.support.status import ShotKind
-from tests.export.test_formats import after_effects_tracks, nuke_curves, nuke_nodes
 from tests.export_problems import hard_reconstruction, noise_images, numbers
+from tests.exported_files import after_effects_tracks, nuke_curves, nuke_nodes
 
 
 def zooming(model: str = "PINHOLE") -> tuple[Reconstruction, np.ndarray]:

@@ -12,7 +12,7 @@ from gtsam.symbol_shorthand import A, L, T, X
 from factorsfm import Options, Reconstruction, ShotKind, Stream, factor_graph
 from factorsfm.graph.factors import affine_of_native
 from factorsfm.synthetic import Motion
-from tests.export.test_export import build
+from tests.exact_result import build
 from tests.rendered import FRAMES, Maps, rendered, simulated_maps, with_fewer_tracks
 
 

@@ -24,9 +24,8 @@ from factorsfm.result.summary import failure_summary, pooled_observability
 from factorsfm.support.json_text import json_text
 from factorsfm.support.options import Options, PolishOptions
 from factorsfm.support.status import FrameStatus, ShotKind
-from tests.adjustment.test_bundle_adjustment import assert_calibrated, normalised, pose_errors, with_prior
-from tests.estimation_problems import angles_between, centers, make_problem, perturbed
-from tests.polish.test_polish import images_of
+from tests.calibration import assert_calibrated, normalised, pose_errors
+from tests.estimation_problems import angles_between, centers, make_problem, mapped_images, perturbed, with_prior
 
 OPTIONS = PolishOptions()
 
@@ -299,7 +298,7 @@ def polished(problem, **options):
     preset = Options.preset_named("geometry")
     preset = replace(preset, polish=replace(preset.polish, **options))
     points = np.arange(len(problem.points)), problem.points
-    return polish(images_of(problem, problem.truth), points, np.array([problem.focal]), preset)
+    return polish(mapped_images(problem, problem.truth), points, np.array([problem.focal]), preset)
 
 
 def test_the_polish_says_what_carries_each_camera():

@@ -7,7 +7,6 @@ import pytest
 
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.observations import Observations
-from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.polish.camera_starts import converge_cameras, in_front
 from factorsfm.polish.connected_frames import connected_frames
 from factorsfm.polish.polish import polish
@@ -15,18 +14,7 @@ from factorsfm.polish.start import with_all_points
 from factorsfm.support.errors import ReconstructionError
 from factorsfm.support.options import Options
 from factorsfm.support.status import FrameStatus, ShotKind
-from tests.estimation_problems import angles_between, in_unit_of, make_problem, tracks_at
-
-
-def images_of(problem, state):
-    """Mapped images with the poses of `state` and the tracks of the problem."""
-    images = []
-    for k in range(len(state.rotation)):
-        ids, xy = problem.of_frame(k)
-        image = MappedImage(tracks_at(k, ids, xy), FrameStatus.REGISTERED, "")
-        image.rotation, image.translation = state.rotation[k], state.translation[k]
-        images.append(image)
-    return images
+from tests.estimation_problems import angles_between, in_unit_of, make_problem, mapped_images, tracks_at
 
 
 def reversed_depth(state):
@@ -50,7 +38,7 @@ def test_the_truth_is_found_from_a_damaged_map(motion, damage):
     problem = make_problem(motion, frames=12, points=200, parallax=0.05, noise_px=0.1)
     start = damage(problem.truth)
     points = np.arange(len(start.bearing)), start.points
-    result = polish(images_of(problem, start), points, np.array([problem.focal]), Options.preset_named("geometry"))
+    result = polish(mapped_images(problem, start), points, np.array([problem.focal]), Options.preset_named("geometry"))
     assert result.motion.kind is ShotKind.GENERAL
     state = in_unit_of(result.state, problem_truth := replace(
         problem.truth,
@@ -81,7 +69,7 @@ def test_a_long_shot_registers_the_frames_between_on_the_polished_points():
     options = Options.preset_named("geometry")
     options = replace(options, polish=replace(options.polish, max_frames=6))
     points = np.arange(len(problem.truth.bearing)), problem.truth.points
-    result = polish(images_of(problem, problem.truth), points, np.array([problem.focal]), options)
+    result = polish(mapped_images(problem, problem.truth), points, np.array([problem.focal]), options)
     assert result.frames == list(range(12))
     assert result.covariance.shape == (12, 6, 6)
     assert angles_between(result.state.rotation, problem.truth.rotation).max() < 1e-3
@@ -146,11 +134,11 @@ def test_frames_that_no_track_holds_are_left_out_and_change_nothing(motion, dark
     problem = make_problem(motion, frames=15, points=200, parallax=0.05, noise_px=0.1)
     points = np.arange(len(problem.truth.bearing)), problem.truth.points
     options, focal = Options.preset_named("geometry"), np.array([problem.focal])
-    result = polish(with_dark_frames(images_of(problem, problem.truth), dark, kept), points, focal, options)
+    result = polish(with_dark_frames(mapped_images(problem, problem.truth), dark, kept), points, focal, options)
     light = [k for k in range(15) if k not in dark]
     assert result.frames == light
     assert {k: why.split(" needed")[0] for k, why in result.left_out.items()} == dict.fromkeys(dark, f"{kept} of 15")
-    only = images_of(problem, problem.truth)
+    only = mapped_images(problem, problem.truth)
     for k in dark:
         only[k].forget(FrameStatus.BLANK, "")
     alone = polish(only, points, focal, options)
@@ -165,7 +153,7 @@ def test_frames_that_no_track_holds_are_left_out_and_change_nothing(motion, dark
 
 def test_a_weak_first_camera_is_the_world_but_does_not_spoil_the_others():
     problem = make_problem("truck", frames=15, points=200, parallax=0.05, noise_px=0.1)
-    images = with_dark_frames(images_of(problem, problem.truth), [0], kept=16)
+    images = with_dark_frames(mapped_images(problem, problem.truth), [0], kept=16)
     points = np.arange(len(problem.truth.bearing)), problem.truth.points
     result = polish(images, points, np.array([problem.focal]), Options.preset_named("geometry"))
     assert result.frames == list(range(15))
@@ -181,7 +169,7 @@ def test_a_weak_first_camera_is_the_world_but_does_not_spoil_the_others():
 
 def test_without_tracks_that_join_frames_there_is_no_result():
     problem = make_problem("truck", frames=6, points=200, noise_px=0.1)
-    images = images_of(problem, problem.truth)
+    images = mapped_images(problem, problem.truth)
     for k, image in enumerate(images):
         image.tracks = replace(image.tracks, ids=image.tracks.ids + 1000 * k)
     points = np.arange(len(problem.truth.bearing)), problem.truth.points

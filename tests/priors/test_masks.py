@@ -12,7 +12,7 @@ from factorsfm.frames.frame import Frame
 from factorsfm.frames.reading import read_frames
 from factorsfm.priors import MaskFolder, MaskModel, NetworkSpec, open_masks
 from factorsfm.support.errors import InputError, ModelError
-from tests.priors.test_models import save_network
+from tests.networks import save_network
 
 SHOT = "studiosim/d02_livingroom_truck_actor"
 

@@ -6,41 +6,21 @@ import logging
 import shutil
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import onnx
 import pytest
 from onnx import TensorProto, helper
 
 from factorsfm.priors import models
 from factorsfm.priors.networks import NETWORK_SPECS, Network, NetworkSpec, network_family
 from factorsfm.support.errors import ModelError
+from tests.networks import save_network
 
 NAME = "tcmonodepth"
 FILE = models.MODELS[NAME].file
-
-
-def save_network(
-    path: Path,
-    input_shape: Sequence[int | str],
-    nodes: Sequence[onnx.NodeProto] = (),
-    input_type: int = TensorProto.FLOAT,
-    output_type: int = TensorProto.FLOAT,
-    extra_inputs: Sequence[onnx.ValueInfoProto] = (),
-) -> Path:
-    """Write a tiny ONNX network from "image" to "out"; by default it returns its input."""
-    graph = helper.make_graph(
-        list(nodes) or [helper.make_node("Identity", ["image"], ["out"])],
-        "tiny",
-        [helper.make_tensor_value_info("image", input_type, input_shape), *extra_inputs],
-        [helper.make_tensor_value_info("out", output_type, None)],
-        [helper.make_tensor("zero", TensorProto.INT64, [], [0])],
-    )
-    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8), path)
-    return path
 
 
 @pytest.fixture

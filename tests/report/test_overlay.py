@@ -16,7 +16,7 @@ from factorsfm.report.result_folder import write_folder
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.support.errors import InputError
 from factorsfm.support.status import FrameStatus, ShotKind
-from tests.export.test_export import build
+from tests.exact_result import build
 
 CAMERA = pycolmap.Camera(model="OPENCV", width=480, height=270, params=[400, 410, 243, 133, -0.12, 0.02, 0.001, 0.001])
 FLOOR, TILT = 1.2, np.radians(4)

@@ -17,7 +17,7 @@ from factorsfm.report.wording import explanation, verdict_sentence
 from factorsfm.result.reconstruction import Reconstruction
 from factorsfm.result.summary import verdict
 from factorsfm.support.status import ShotKind
-from tests.export.test_export import build
+from tests.exact_result import build
 
 VOID = {"meta", "link", "br", "input", "img", "hr"}
 

@@ -11,7 +11,7 @@ import pytest
 
 from factorsfm.report import Thumbnails, failure_html, report_html
 from factorsfm.result.reconstruction import Reconstruction
-from tests.export.test_export import build
+from tests.exact_result import build
 from tests.report.chromium import EXECUTABLE, MISSING, Chromium
 
 pytestmark = pytest.mark.skipif(EXECUTABLE is None, reason=MISSING)

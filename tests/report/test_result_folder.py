@@ -13,7 +13,7 @@ from factorsfm.report.result_folder import check_directory, write_failure, write
 from factorsfm.result.reading import read_result
 from factorsfm.result.reconstruction import Reconstruction
 from factorsfm.support.errors import InputError
-from tests.export.test_export import FILES, build
+from tests.exact_result import FILES, build
 
 Write = Callable[[Path], None]
 EARLIER, NEW = "earlier", "new"

@@ -21,7 +21,7 @@ from factorsfm.report.result_folder import write_failure
 from factorsfm.result.reading import read_result
 from factorsfm.result.reconstruction import LensFit, RollingShutter
 from factorsfm.support.errors import InputError
-from tests.export.test_export import build
+from tests.exact_result import build
 from tests.export_problems import hard_reconstruction
 
 

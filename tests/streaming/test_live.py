@@ -9,7 +9,7 @@ import factorsfm
 from factorsfm import Frame, FrameStatus, FrameUpdate, InputError, Options, RawFormat, ReconstructionError, Stream
 from factorsfm.camera.guess import guess_camera
 from factorsfm.synthetic import RenderedShot, render_shot, simulate_prior
-from tests.camera.test_camera import jpeg_with_focal_length
+from tests.image_files import jpeg_with_focal_length
 from tests.rendered import FRAMES, Maps, quick_presets, rendered, simulated_maps, with_fewer_tracks
 
 BLACK = np.zeros((180, 320, 3), np.uint8)

@@ -16,8 +16,8 @@ from factorsfm.synthetic import RenderedShot, render_shot
 from factorsfm.tracks import matches
 from factorsfm.tracks.learned import FEATURES, Keypoints, LearnedFeatures, common_features
 from factorsfm.tracks.matches import match_images
-from tests.priors.test_models import save_network
-from tests.tracks.test_matches import write_images
+from tests.image_files import write_images
+from tests.networks import save_network
 
 
 class Corners(LearnedFeatures):

@@ -11,6 +11,7 @@ from factorsfm.synthetic import RenderedShot, render_shot
 from factorsfm.tracks import matches
 from factorsfm.tracks.match_tracks import tracks_from_matches
 from factorsfm.tracks.matches import PairMatches, match_images, read_matches
+from tests.image_files import write_images
 
 
 def keypoints(*counts: int) -> list[np.ndarray]:
@@ -95,14 +96,6 @@ def test_components_agree_with_a_search_of_the_graph() -> None:
 @pytest.fixture(scope="module")
 def shot() -> RenderedShot:
     return render_shot("truck", 3, 400, 300, parallax=0.15)
-
-
-def write_images(shot: RenderedShot, folder: Path) -> list[str]:
-    folder.mkdir(exist_ok=True)
-    names = [f"{k}.png" for k in range(len(shot.images))]
-    for name, image in zip(names, shot.images, strict=True):
-        cv2.imwrite(str(folder / name), image)
-    return names
 
 
 def test_matches_obey_the_true_geometry(shot: RenderedShot, tmp_path: Path) -> None:
