@@ -15,15 +15,11 @@ from factorsfm.batch.outcome import is_result_of
 from factorsfm.camera.files import camera_to_json
 from factorsfm.frames.cuts import find_shots
 from factorsfm.frames.folders import list_files
+from factorsfm.frames.video import VIDEO_SUFFIXES
 from factorsfm.priors.masks import MaskFolder
 from factorsfm.support.errors import InputError
 from factorsfm.support.json_text import json_text
 from factorsfm.support.options import LensFreedom, ShutterUse
-
-VIDEO_SUFFIXES = (
-    *(".avi", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg"),
-    *(".mpg", ".mts", ".mxf", ".ogv", ".ts", ".webm", ".wmv"),
-)
 
 
 @dataclass(frozen=True, slots=True)

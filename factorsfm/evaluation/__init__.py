@@ -1,7 +1,7 @@
-"""Metrics, data-set readers and baselines: everything that judges a reconstruction.
+"""What judges a reconstruction: metrics, readers of data sets, baselines, degraded footage and useless priors.
 
-Takes and gives numpy arrays; `pose_arrays` makes them of poses. May import `api` and what lies below it; no room but
-the command line imports it.
+Takes and gives numpy arrays; `pose_arrays` converts poses to them. May import `api` and what lies below it; only the
+command line imports it.
 """
 
 from factorsfm.evaluation.metrics import (

@@ -1,4 +1,4 @@
-"""COLMAP on the same frames, with the true lens held fixed and the same masks: what there is to beat."""
+"""Baselines: COLMAP on the same frames, with the true lens held fixed and the same masks."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from factorsfm.support.similarity import pose_arrays
 
 Array = NDArray[np.float64]
 
-EXHAUSTIVE_UP_TO = 40  # images; above, each is matched with its neighbours only
-OVERLAP = 15
+EXHAUSTIVE_UP_TO = 40  # images; in a longer shot each is matched with its neighbours only
+OVERLAP = 15  # neighbours on either side
 
-# Tuned for small parallax: smallest triangulation angle of the first pair and of a point that is kept,
-# degrees. The rest is tried where the first leaves more than 5 % of the images out.
+# Smallest triangulation angles, degrees, of the first pair and of a point that is kept, tuned for small parallax. The
+# next pair is tried if the one before registers fewer than 95 % of the images.
 TUNED_ANGLES = ((0.5, 0.05), (2.0, 0.1), (0.2, 0.02), (4.0, 0.2))
 ENOUGH_REGISTERED = 0.95
 SMALL_ANGLE = 0.05  # degrees, smallest triangulation angle of a new point
@@ -35,19 +35,19 @@ _SEED = 0
 
 @dataclass(frozen=True, slots=True)
 class BaselineResult:
-    """What COLMAP made of the frames; empty where it found no model.
+    """COLMAP's model of the frames; without points and poses if it found none.
 
     Attributes:
         indices: (n,) frame indices, in the order given.
-        rotations: (n, 3, 3) world_from_cam, NaN where not registered.
-        centers: (n, 3) camera centres, NaN where not registered.
+        rotations: (n, 3, 3) world_from_cam, NaN for unregistered frames.
+        centers: (n, 3) camera centres, NaN for unregistered frames.
         points: (k, 3) world coordinates.
         observation_frame: (m,) row in `indices` of each observation of a point.
         observation_point: (m,) row in `points`.
         observation_xy: (m, 2) pixels, centres at integers.
-        observation_depth: (m,) z of the point in that camera.
+        observation_depth: (m,) z-depth of the point in that camera.
         seconds: wall time of `extraction`, `matching` and `mapping`.
-        settings: the mapper settings that were kept, in words.
+        settings: the settings of the mapper in words.
     """
 
     indices: NDArray[np.int64]
@@ -64,7 +64,7 @@ class BaselineResult:
 
 @dataclass(frozen=True, slots=True)
 class Matches:
-    """Images with verified matches in a COLMAP database, from which several mappers can start.
+    """Images with verified matches in a COLMAP database, which several mappers can use.
 
     Attributes:
         folder: holds `database.db` and `images/`; the mappers write beside them.
@@ -83,16 +83,19 @@ def run_baselines(
     methods: Sequence[Callable[[Matches], BaselineResult]] | None = None,
     max_features: int = 8192,
 ) -> dict[str, BaselineResult]:
-    """Extract and match once in a temporary folder, then run each method; the results by method name.
+    """Extract and match features once in a temporary folder, then run each method.
 
     Args:
-        shot: gives the lens and the masks.
+        shot: its lens and masks are used.
         frames: the images to reconstruct.
-        methods: `colmap_default`, `colmap_tuned`, `colmap_global`; all of them by default.
+        methods: some of `colmap_default`, `colmap_tuned`, `colmap_global`; None runs all.
         max_features: SIFT keypoints per image; the default is COLMAP's.
 
+    Returns:
+        The results by the name of the method.
+
     Raises:
-        InputError: fewer than two frames, or frames that do not have the size of the lens.
+        InputError: fewer than two frames, or frames of another size than the lens.
     """
     with tempfile.TemporaryDirectory(prefix="colmap-") as folder:
         matches = match_frames(shot, frames, Path(folder), max_features)
@@ -102,10 +105,11 @@ def run_baselines(
 def match_frames(shot: Shot, frames: Iterable[Frame], folder: Path, max_features: int = 8192) -> Matches:
     """Write images and masks to an empty folder, extract SIFT features and match them.
 
-    All pairs are matched up to 40 images, else 15 neighbours and then every power of two (quadratic overlap).
+    Up to 40 images, all pairs are matched; beyond, each image with 15 neighbours and with those at distances of powers
+    of two (quadratic overlap).
 
     Raises:
-        InputError: fewer than two frames, or frames that do not have the size of the lens.
+        InputError: fewer than two frames, or frames of another size than the lens.
     """
     images, masks, database = folder / "images", folder / "masks", folder / "database.db"
     images.mkdir()
@@ -157,16 +161,16 @@ def match_frames(shot: Shot, frames: Iterable[Frame], folder: Path, max_features
 
 
 def colmap_default(matches: Matches) -> BaselineResult:
-    """Incremental mapping with the thresholds that COLMAP ships with."""
+    """Incremental mapping with COLMAP's default thresholds."""
     start = time.perf_counter()
     best = _incremental(matches, default_options())
     return _result(matches, best, time.perf_counter() - start, "default")
 
 
 def colmap_tuned(matches: Matches) -> BaselineResult:
-    """Incremental mapping tuned for small parallax: further settings are tried where few images register.
+    """Incremental mapping tuned for small parallax; further settings are tried while too few images register.
 
-    The model with the most registered images is kept, of equal ones that with the most points.
+    The model with the most registered images is kept; among equal ones, that with the most points.
     """
     start = time.perf_counter()
     best, settings = None, "none"
@@ -198,7 +202,7 @@ BASELINES = (colmap_default, colmap_tuned, colmap_global)
 
 
 def default_options() -> pycolmap.IncrementalPipelineOptions:
-    """COLMAP's own thresholds with the lens held fixed."""
+    """COLMAP's default thresholds, with the lens held fixed."""
     options = pycolmap.IncrementalPipelineOptions()
     options.ba_refine_focal_length = False
     options.ba_refine_principal_point = False
@@ -209,7 +213,12 @@ def default_options() -> pycolmap.IncrementalPipelineOptions:
 
 
 def tuned_options(init_angle: float, filter_angle: float) -> pycolmap.IncrementalPipelineOptions:
-    """Thresholds relaxed for small parallax, the lens held fixed; angles in degrees."""
+    """Thresholds relaxed for small parallax, with the lens held fixed.
+
+    Args:
+        init_angle: smallest triangulation angle of the first pair, degrees.
+        filter_angle: smallest triangulation angle of a point that is kept, degrees.
+    """
     options = default_options()
     options.min_model_size = 3
     options.mapper.init_min_tri_angle = init_angle
@@ -223,7 +232,7 @@ def tuned_options(init_angle: float, filter_angle: float) -> pycolmap.Incrementa
 
 
 def global_options() -> pycolmap.GlobalPipelineOptions:
-    """Global mapping with angles relaxed for small parallax and the lens held fixed."""
+    """Global mapping with angles relaxed for small parallax, with the lens held fixed."""
     options = pycolmap.GlobalPipelineOptions()
     options.mapper.bundle_adjustment.refine_focal_length = False
     options.mapper.bundle_adjustment.refine_principal_point = False

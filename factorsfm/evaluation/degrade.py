@@ -1,4 +1,4 @@
-"""Footage made worse on purpose: blur, noise and compression, the same in every run."""
+"""Degraded footage: blur, noise and compression, the same in every run."""
 
 from __future__ import annotations
 
@@ -20,17 +20,20 @@ def degrade(
     noise: float = 8.0,
     jpeg_quality: int = 40,
 ) -> NDArray[np.uint8]:
-    """An image after a soft lens, a noisy sensor and strong compression, in this order.
+    """Blur an image, add noise and compress it as JPEG, in this order.
 
     Args:
         image: (h, w, 3) BGR or (h, w) grey.
         rng: source of the noise.
-        blur: standard deviation of the Gaussian blur, pixels; 0 = none.
+        blur: standard deviation of the Gaussian blur, pixels; 0 for none.
         noise: standard deviation of the noise, grey levels.
         jpeg_quality: 1 to 100.
 
+    Returns:
+        The image, in the same shape.
+
     Raises:
-        InputError: a negative blur or noise, or a quality out of range.
+        InputError: a negative blur or noise, or a quality outside 1 to 100.
     """
     if blur < 0 or noise < 0 or not 1 <= jpeg_quality <= 100:
         raise InputError(
@@ -50,7 +53,7 @@ def degrade(
 def degraded_frames(
     frames: Iterable[Frame], seed: int = 0, blur: float = 1.0, noise: float = 8.0, jpeg_quality: int = 40
 ) -> Iterator[Frame]:
-    """The frames, each degraded with noise that depends on the seed and the frame's index alone."""
+    """The frames, degraded by `degrade`; the noise depends on the seed and the frame's index only."""
     for frame in frames:
         rng = np.random.default_rng([seed, frame.index])
         yield replace(frame, image=degrade(frame.image, rng, blur, noise, jpeg_quality))

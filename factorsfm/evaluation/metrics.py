@@ -1,7 +1,9 @@
-"""Errors of trajectories and points against the truth, and the summaries that the paper's tables use.
+"""Errors of trajectories and points against the truth, and the summaries in the paper's tables.
 
-Poses are arrays: `world_from_cam` rotations (n, 3, 3) and camera centres (n, 3), NaN for unregistered frames.
-Lengths are in the units of the truth (metres), angles in degrees, shares in percent.
+Poses are arrays: rotations `world_from_cam` (n, 3, 3) and camera centres (n, 3), NaN for unregistered frames. Lengths
+are in the unit of the truth (metres), angles in degrees, shares in percent.
+
+ATE: absolute trajectory error; T-RPE and R-RPE: translation and rotation part of the relative pose error.
 """
 
 from __future__ import annotations
@@ -25,18 +27,18 @@ T_RPE_THRESHOLDS = (0.001, 0.005)
 R_RPE_THRESHOLDS = (0.02, 0.1)
 RELATIVE_POSE_THRESHOLDS = (1.0, 5.0, 20.0)  # degrees
 
-_EDGE = 1.05  # largest over smallest true depth in 3x3 pixels, above which a point is left out
+_EDGE_RATIO = 1.05  # largest over smallest true depth in 3 x 3 pixels, above which a point is left out
 
 
 @dataclass(frozen=True, slots=True)
 class TrajectoryErrors:
-    """Errors after similarity alignment; an unregistered frame, or a pair that holds one, is inf.
+    """Errors after similarity alignment; infinite for an unregistered frame, and for a pair that holds one.
 
     Attributes:
-        ate: (n,) distance of the camera centres.
+        ate: (n,) distance between the estimated and the true camera centre.
         t_rpe: (n - 1,) translation error of the motion from each frame to the next.
-        r_rpe: (n - 1,) rotation error of the same, degrees.
-        alignment: truth from estimate, None where no frame is registered.
+        r_rpe: (n - 1,) rotation error of the same motion, degrees.
+        alignment: truth from estimate; None if no frame is registered.
     """
 
     ate: Array
@@ -55,12 +57,12 @@ def trajectory_errors(
     """ATE per frame, and T-RPE and R-RPE per pair of consecutive frames.
 
     Args:
-        rotations, true_rotations: (n, 3, 3) world_from_cam; unregistered frames NaN.
-        centers, true_centers: (n, 3).
+        rotations, true_rotations: (n, 3, 3) world_from_cam; NaN for unregistered frames.
+        centers, true_centers: (n, 3); NaN for unregistered frames.
         scale: see `align`.
 
     Raises:
-        InputError: the arrays do not fit together, or the truth is incomplete.
+        InputError: the shapes do not agree, or the truth is not finite.
     """
     rotations, centers, true_rotations, true_centers = check_trajectories(
         rotations, centers, true_rotations, true_centers
@@ -72,53 +74,56 @@ def trajectory_errors(
     alignment = align(rotations, centers, true_rotations, true_centers, scale)
     centers, rotations = alignment.points(centers), alignment.rotations(rotations)
     first, second = np.arange(n - 1), np.arange(1, n)
-    turn, move = _relative(rotations, centers, first, second)
-    true_turn, true_move = _relative(true_rotations, true_centers, first, second)
+    rotation, translation = _relative(rotations, centers, first, second)
+    true_rotation, true_translation = _relative(true_rotations, true_centers, first, second)
     return TrajectoryErrors(
         ate=_inf_where_missing(np.linalg.norm(centers - true_centers, axis=1)),
-        t_rpe=_inf_where_missing(np.linalg.norm(move - true_move, axis=1)),
-        r_rpe=_inf_where_missing(rotation_angle(turn, true_turn)),
+        t_rpe=_inf_where_missing(np.linalg.norm(translation - true_translation, axis=1)),
+        r_rpe=_inf_where_missing(rotation_angle(rotation, true_rotation)),
         alignment=alignment,
     )
 
 
 def rotation_angle(a: Array, b: Array) -> Array:
-    """Angle (...) between rotations (..., 3, 3), degrees; from the chord, exact for small angles."""
+    """Angle (...) between rotations (..., 3, 3), degrees; from the chord, which is exact for small angles."""
     chord = np.linalg.norm(a - b, axis=(-2, -1)) / np.sqrt(8.0)
     return np.asarray(np.degrees(2.0 * np.arcsin(np.clip(chord, 0.0, 1.0))))
 
 
 def relative_pose_errors(rotations: Array, centers: Array, true_rotations: Array, true_centers: Array) -> Array:
-    """(n (n - 1) / 2,) the larger of rotation and translation-direction error of every pair, degrees.
+    """Relative pose error of every pair of frames: the larger of the rotation and the translation direction error.
 
-    Pairs with an unregistered frame have 180. Where the truth does not move between the two frames there is
-    no direction, and the rotation counts alone; where only the estimate does not move, the error is 180.
+    It is 180 for a pair with an unregistered frame. If the true camera does not move between the two frames, only the
+    rotation counts; if only the estimated camera does not move, the error is 180.
 
     Args:
-        rotations, true_rotations: (n, 3, 3) world_from_cam; unregistered frames NaN.
-        centers, true_centers: (n, 3).
+        rotations, true_rotations: (n, 3, 3) world_from_cam; NaN for unregistered frames.
+        centers, true_centers: (n, 3); NaN for unregistered frames.
+
+    Returns:
+        (n (n - 1) / 2,) degrees.
 
     Raises:
-        InputError: the arrays do not fit together, or the truth is incomplete.
+        InputError: the shapes do not agree, or the truth is not finite.
     """
     rotations, centers, true_rotations, true_centers = check_trajectories(
         rotations, centers, true_rotations, true_centers
     )
     first, second = np.triu_indices(len(centers), k=1)
-    turn, move = _relative(rotations, centers, first, second)
-    true_turn, true_move = _relative(true_rotations, true_centers, first, second)
-    cross = np.linalg.norm(np.cross(move, true_move), axis=1)
-    direction = np.degrees(np.arctan2(cross, np.sum(move * true_move, axis=1)))
-    direction[~move.any(axis=1)] = 180.0
-    direction[~true_move.any(axis=1)] = 0.0
-    errors = np.maximum(rotation_angle(turn, true_turn), direction)
+    rotation, translation = _relative(rotations, centers, first, second)
+    true_rotation, true_translation = _relative(true_rotations, true_centers, first, second)
+    cross = np.linalg.norm(np.cross(translation, true_translation), axis=1)
+    direction = np.degrees(np.arctan2(cross, np.sum(translation * true_translation, axis=1)))
+    direction[~translation.any(axis=1)] = 180.0
+    direction[~true_translation.any(axis=1)] = 0.0
+    errors = np.maximum(rotation_angle(rotation, true_rotation), direction)
     return np.where(np.isfinite(errors), errors, 180.0)
 
 
 def auc(errors: ArrayLike, threshold: float) -> float:
-    """Area under the recall curve from 0 to the threshold, percent of the full area.
+    """Area under the recall curve from 0 to the threshold, in percent of the full area.
 
-    The recall curve is a step function, so its exact area is the mean of ``max(0, 1 - error / threshold)``.
+    The recall curve is a step function, so that its exact area is the mean of ``max(0, 1 - error / threshold)``.
 
     Raises:
         InputError: no errors, a NaN or negative one, or a threshold that is not positive.
@@ -130,7 +135,7 @@ def auc(errors: ArrayLike, threshold: float) -> float:
 
 
 def recall_curve(errors: ArrayLike, thresholds: ArrayLike) -> Array:
-    """Percent of the errors that do not exceed each threshold (k,).
+    """(k,) percent of the errors that do not exceed each of k thresholds.
 
     Raises:
         InputError: no errors, or a NaN or negative one.
@@ -140,11 +145,11 @@ def recall_curve(errors: ArrayLike, thresholds: ArrayLike) -> Array:
 
 
 def parallax(centers: Array, depths: ArrayLike) -> float:
-    """Largest distance of a camera from the first registered one over the median depth of the points.
+    """Largest distance of a camera from the first registered one over the median depth of the points, as in the paper.
 
     Args:
-        centers: (n, 3); unregistered frames NaN.
-        depths: (m,) depths of the points in the cameras; NaN entries, and points behind the camera, do not count.
+        centers: (n, 3) in the unit of the depths; NaN for unregistered frames.
+        depths: (m,) z-depths of the points in the cameras; NaN and negative ones do not count.
 
     Raises:
         InputError: no registered frame, or no depth.
@@ -160,11 +165,11 @@ def parallax(centers: Array, depths: ArrayLike) -> float:
 
 @dataclass(frozen=True, slots=True)
 class DepthErrors:
-    """Depths of points beside the true ones; points without a trustworthy truth are NaN in `truth`.
+    """Estimated and true depths of m points.
 
     Attributes:
-        estimate: (m,) estimated depths in the units of the truth.
-        truth: (m,) true depths, NaN where there is none or at a depth edge.
+        estimate: (m,) estimated depths in the unit of the truth.
+        truth: (m,) true depths; NaN where there is none, and at depth edges.
     """
 
     estimate: Array
@@ -172,7 +177,7 @@ class DepthErrors:
 
     @property
     def ratio(self) -> Array:
-        """(m,) ``max(d / d*, d* / d)``; inf for points behind the camera, NaN without truth."""
+        """(m,) ``max(d / d*, d* / d)``; infinite for points behind the camera, NaN without truth."""
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = np.maximum(self.estimate / self.truth, self.truth / self.estimate)
         return np.where(self.estimate > 0, ratio, np.where(np.isnan(self.truth), np.nan, np.inf))
@@ -189,7 +194,7 @@ class DepthErrors:
 
     @staticmethod
     def pool(parts: Iterable[DepthErrors]) -> DepthErrors:
-        """The errors of several images or shots as one."""
+        """The errors of several images or shots together."""
         kept = list(parts)
         none = [np.empty(0)]
         return DepthErrors(
@@ -198,11 +203,11 @@ class DepthErrors:
         )
 
     def summary(self) -> dict[str, float]:
-        """Percent of the points with truth within each bound, and how many points there are.
+        """Shares of the points with truth, in percent, whose error is within bounds.
 
-        Keys: ``delta<1.05`` to ``delta<1.05^3`` and ``delta<1.25`` to ``delta<1.25^3`` (ratio),
-        ``theta<1cm`` to ``theta<25cm`` (absolute, metres assumed), ``within 5%`` (relative) and ``points``
-        (a count). Without any point the shares are NaN.
+        Keys: ``delta<1.05`` to ``delta<1.05^3`` and ``delta<1.25`` to ``delta<1.25^3`` for the ratio; ``theta<1cm`` to
+        ``theta<25cm`` for the absolute error, which must be in metres; ``within 5%`` for the relative error; and
+        ``points`` for the number of points. Without points the shares are NaN.
         """
         has_truth = np.isfinite(self.truth)
         points = int(has_truth.sum())
@@ -225,21 +230,20 @@ class DepthErrors:
 def point_depth_errors(
     xy: Array, depths: Array, truth: NDArray[np.float32], image_size: Sequence[int], scale: float = 1.0
 ) -> DepthErrors:
-    """Depths of points seen in one image, beside its true depth map.
+    """Estimated and true depths of points in one image.
 
-    The map is read at the nearest pixel; it may be smaller or larger than the image, both covering the
-    same field of view. Points outside the image, without true depth, or where the true depth of the
-    3 x 3 neighbourhood varies by more than 5 % are NaN in the result.
+    The true depth is read at the nearest pixel of its map, which covers the image at any resolution. It is NaN for
+    points outside the image, where the map has none, and where it varies by more than 5 % among 3 x 3 pixels.
 
     Args:
         xy: (m, 2) pixels, centres at integers.
-        depths: (m,) z in the camera, units of the estimate.
-        truth: (h, w) true z, NaN (or not positive) = none.
+        depths: (m,) z-depth in the camera, in units of the estimate.
+        truth: (h, w) true z-depth; none where it is NaN or not positive.
         image_size: width and height of the image of `xy`.
         scale: truth units per estimate unit (`Similarity.scale`).
 
     Raises:
-        InputError: the shapes do not fit together.
+        InputError: the shapes do not agree.
     """
     xy, depths = np.asarray(xy, np.float64), np.asarray(depths, np.float64)
     if xy.shape != (*depths.shape, 2) or depths.ndim != 1:
@@ -258,18 +262,18 @@ def point_depth_errors(
 
 
 def _without_edges(truth: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The depth map with NaN where it has no depth or where its 3 x 3 neighbourhood holds a jump."""
+    """The depth map with NaN where it has no depth, and where it has a depth edge among 3 x 3 pixels."""
     valid = np.isfinite(truth) & (truth > 0)
     kernel = np.ones((3, 3), np.uint8)
     far = cv2.dilate(np.where(valid, truth, 0.0).astype(np.float32), kernel)
     near = cv2.erode(np.where(valid, truth, np.inf).astype(np.float32), kernel)
-    return np.where(valid & (far / near <= _EDGE), truth, np.nan).astype(np.float32)
+    return np.where(valid & (far / near <= _EDGE_RATIO), truth, np.nan).astype(np.float32)
 
 
 def _relative(
     rotations: Array, centers: Array, first: NDArray[np.int64], second: NDArray[np.int64]
 ) -> tuple[Array, Array]:
-    """Rotation and translation of ``T_first^-1 T_second`` for poses ``T = world_from_cam``."""
+    """Rotations (k, 3, 3) and translations (k, 3) first_from_second of k pairs of poses world_from_cam."""
     inverse = rotations[first].transpose(0, 2, 1)
     return inverse @ rotations[second], np.einsum("nij,nj->ni", inverse, centers[second] - centers[first])
 
@@ -281,5 +285,5 @@ def _inf_where_missing(errors: Array) -> Array:
 def _check_errors(errors: ArrayLike) -> Array:
     checked = np.asarray(errors, np.float64).ravel()
     if not checked.size or not (checked >= 0).all():
-        raise InputError("errors must be a non-empty list of numbers that are not negative, without NaN")
+        raise InputError("errors must be numbers that are not negative, at least one, without NaN")
     return checked

@@ -1,4 +1,4 @@
-"""Shots with ground truth, from the formats in which data sets are distributed."""
+"""Readers of data sets: shots with ground truth, from the formats in which they are distributed."""
 
 from __future__ import annotations
 
@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from factorsfm.camera.files import read_camera
 from factorsfm.evaluation.plain_pickle import load_plain_pickle
-from factorsfm.evaluation.truth import DepthLookup, DepthMaps, RawDepthMaps, Shot, no_depth, read_image
-from factorsfm.frames.folders import IMAGE_SUFFIXES
+from factorsfm.evaluation.truth import DepthLookup, DepthMaps, RawDepthMaps, Shot, no_depth
+from factorsfm.frames.folders import list_files, list_images, read_image
+from factorsfm.frames.video import VIDEO_SUFFIXES
 from factorsfm.support.errors import InputError
 from factorsfm.support.rotations import nearest_rotation
 from factorsfm.support.similarity import pose_arrays
@@ -28,18 +29,19 @@ logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
-VIDEO_SUFFIXES = {".mp4", ".mov", ".mkv", ".avi", ".webm"}
-_TUM_TOLERANCE = 0.02  # seconds between an image and its pose or depth map
-_KINECT = (640, 480, 525.0, 525.0, 320.0, 240.0)  # nominal colour camera: size, fx, fy, cx, cy
+_TUM_TOLERANCE_SECONDS = 0.02  # between an image and its pose or depth map
+_TUM_DEPTH_UNIT = 1.0 / 5000.0  # metres per grey level
+_KINECT = (640, 480, 525.0, 525.0, 320.0, 240.0)  # nominal colour camera: width, height, fx, fy, cx, cy
 
 
 def read_shot(folder: str | Path, unit: float = 1.0) -> Shot:
     """A set of this project: `shot.mp4` or `images/`, `camera.json`, `groundtruth.txt`, `depth/`, `masks/`.
 
-    `groundtruth.txt` holds ``frame tx ty tz qx qy qz qw`` (camera to world); `camera.json` the unit of the
-    16-bit depth maps as `depth_unit_m` or `depth_unit_mm`, and the maps carry the frame's number as name.
+    `groundtruth.txt` holds ``frame tx ty tz qx qy qz qw`` (world_from_cam). `depth/` holds 16-bit maps whose names are
+    the frame indices; `camera.json` has their unit as `depth_unit_m` or `depth_unit_mm`.
 
     Args:
+        folder: the set.
         unit: metres per unit of the true translations.
 
     Raises:
@@ -71,12 +73,12 @@ def read_shot(folder: str | Path, unit: float = 1.0) -> Shot:
 def read_studiosfm(folder: str | Path) -> Shot:
     """A StudioSfM shot as its authors distribute it: images or a video, and `camera.pkl`.
 
-    The pickle maps image ids to ``{'intr_mtx': 3x3, 'v2c': 4x4 cam_from_world}`` and is read without
-    executing anything. Ids name image files (whole name, stem, or the last number in the name); in a video
-    they count frames from the smallest id. The intrinsics are taken in COLMAP's pixel convention.
+    The pickle maps image ids to ``{'intr_mtx': 3x3, 'v2c': 4x4 cam_from_world}``; it is read without executing code in
+    it. An id is the name of an image file, its stem, or the last number in it; in a video, ids count frames from the
+    smallest one. The intrinsics are in COLMAP's pixel convention.
 
     Raises:
-        InputError: files are missing, the pickle holds anything else, or ids match no image.
+        InputError: a file is missing, the pickle holds something else, or an id matches no image.
     """
     folder = Path(folder)
     records = load_plain_pickle(folder / "camera.pkl")
@@ -98,7 +100,7 @@ def read_studiosfm(folder: str | Path) -> Shot:
     indices = np.array(sorted(poses))
     intrinsics = np.array([matrices[i] for i in indices])
     if np.ptp(intrinsics, axis=0).max() > 1e-3 * intrinsics.max():
-        logger.warning("%s changes its focal length; the lens of the first frame stands for all.", folder)
+        logger.warning("the focal length of %s changes; all frames get the lens of the first one", folder)
     k = intrinsics[0]
     width, height = _image_size(source, files)
     camera = _pinhole(width, height, k[0, 0], k[1, 1], k[0, 2], k[1, 2])
@@ -109,11 +111,11 @@ def read_studiosfm(folder: str | Path) -> Shot:
 def read_eth3d(folder: str | Path) -> Shot:
     """An ETH3D scene: a COLMAP text model `dslr_calibration_undistorted` (or `_jpg`) beside `images/`.
 
-    True depth (`ground_truth_depth/`, raw float32) belongs to the distorted images; it is used where it is
-    present and has the size of the images.
+    The true depth (`ground_truth_depth/`, raw float32) belongs to the distorted images; maps are used if they have the
+    size of the images.
 
     Raises:
-        InputError: no model, or its images are missing.
+        InputError: the model or its images are missing.
     """
     folder = Path(folder)
     models = [folder / "dslr_calibration_undistorted", folder / "dslr_calibration_jpg"]
@@ -126,17 +128,18 @@ def read_eth3d(folder: str | Path) -> Shot:
     found = {i: maps / f.name for i, f in enumerate(shot.files or ()) if (maps / f.name).is_file()}
     fitting = {i: path for i, path in found.items() if path.stat().st_size == size}
     if len(fitting) < len(found):
-        logger.warning("%s: depth maps left out, since their size is not that of the images.", folder)
+        logger.warning("%s: %d depth maps have another size than the images", folder, len(found) - len(fitting))
     if not fitting:
         return shot
     return replace(shot, depth=RawDepthMaps(fitting, (shot.camera.height, shot.camera.width)))
 
 
 def read_tum(folder: str | Path, camera: pycolmap.Camera) -> Shot:
-    """A TUM RGB-D sequence: `rgb.txt`, `groundtruth.txt`, optional `depth.txt`, matched by time (20 ms).
+    """A TUM RGB-D sequence: `rgb.txt`, `groundtruth.txt` and perhaps `depth.txt`, matched by time within 20 ms.
 
     Args:
-        camera: the lens, which the data set does not store beside the images.
+        folder: the sequence.
+        camera: the lens, which the sequence does not hold.
 
     Raises:
         InputError: a list is missing or unreadable, or no image has a pose.
@@ -150,20 +153,22 @@ def read_tum(folder: str | Path, camera: pycolmap.Camera) -> Shot:
     if (folder / "depth.txt").is_file():
         depth_times, maps = _read_tum_list(folder, "depth.txt")
         nearest, known = _nearest_in_time(depth_times, times)
-        depth = DepthMaps({int(i): maps[nearest[i]] for i in np.flatnonzero(known)}, 1.0 / 5000.0)
+        depth = DepthMaps({int(i): maps[nearest[i]] for i in np.flatnonzero(known)}, _TUM_DEPTH_UNIT)
     indices = np.flatnonzero(posed)
     return _shot(folder.name, folder / "rgb", camera, indices, rotations, centers, depth, files=files)
 
 
 def read_7scenes(folder: str | Path, camera: pycolmap.Camera | None = None) -> Shot:
-    """A 7-Scenes sequence: `frame-XXXXXX.color.png`, `.depth.png` (mm) and `.pose.txt` (camera to world).
+    """A 7-Scenes sequence: `frame-XXXXXX.color.png`, `.depth.png` (mm) and `.pose.txt` (world_from_cam).
+
+    Poses and depth belong to the depth camera of the Kinect, which the data set does not register to the colour camera.
 
     Args:
-        camera: the lens; None takes the nominal colour camera. (As distributed, poses and depth belong to
-            the depth camera of the Kinect, which is not registered to the colour camera.)
+        folder: the sequence.
+        camera: the lens; None takes the nominal colour camera.
 
     Raises:
-        InputError: images or poses are missing.
+        InputError: there are no images or no poses.
     """
     folder = Path(folder)
     files = tuple(sorted(folder.glob("frame-*.color.png")))
@@ -190,12 +195,17 @@ def read_7scenes(folder: str | Path, camera: pycolmap.Camera | None = None) -> S
 
 
 def read_colmap(model: str | Path, images: str | Path, name: str | None = None) -> Shot:
-    """A COLMAP model, text or binary, as truth; frames are all images of the folder that the model names.
+    """A COLMAP model, text or binary, as truth. The frames are all images in the folder of the model's images.
 
-    Where the model has several cameras, the images of the most frequent one are kept.
+    If the model has several cameras, only images of the most frequent one have a true pose.
+
+    Args:
+        model: folder of the model.
+        images: folder to which the names of the images are relative.
+        name: name of the shot; None takes that of the model.
 
     Raises:
-        InputError: the model cannot be read, or its images are missing or spread over several folders.
+        InputError: the model cannot be read, or its images are missing or in several folders.
     """
     model, images = Path(model), Path(images)
     try:
@@ -207,11 +217,11 @@ def read_colmap(model: str | Path, images: str | Path, name: str | None = None) 
         raise InputError(f"the COLMAP model {model} has no registered image")
     camera_id, count = Counter(image.camera_id for image in posed).most_common(1)[0]
     if count < len(posed):
-        logger.warning("%s: the %d images of other cameras are left out.", model, len(posed) - count)
+        logger.warning("%s: %d images of other cameras are left out", model, len(posed) - count)
         posed = [image for image in posed if image.camera_id == camera_id]
     folders = {(images / image.name).parent for image in posed}
     if len(folders) > 1:
-        raise InputError(f"the images of {model} lie in {len(folders)} folders, expected one")
+        raise InputError(f"the images of {model} are in {len(folders)} folders, expected one")
     source = folders.pop()
     files = _images(source)
     position = {path.name: i for i, path in enumerate(files)}
@@ -236,7 +246,7 @@ def _shot(
     masks: Path | None = None,
     files: tuple[Path, ...] | None = None,
 ) -> Shot:
-    """A shot with its frames in ascending order, checked for frames and poses."""
+    """The shot, with its true poses sorted by frame; an error if it has no frames or no poses."""
     if files is not None and not files:
         raise InputError(f"{source} holds no images")
     if not len(indices):
@@ -246,19 +256,19 @@ def _shot(
 
 
 def _find_frames(folder: Path) -> tuple[Path, tuple[Path, ...] | None]:
-    """Images of the folder or of its first subfolder that has any; else its video, without files."""
+    """The folder and its images, or those of its first subfolder that has any; otherwise its video, and None."""
     for candidate in (folder, *sorted(p for p in folder.iterdir() if p.is_dir())):
         files = _images(candidate)
         if files:
             return candidate, files
-    videos = sorted(p for p in folder.iterdir() if p.suffix.lower() in VIDEO_SUFFIXES)
+    videos = list_files(folder, VIDEO_SUFFIXES)
     if len(videos) != 1:
         raise InputError(f"{folder} holds no images and {len(videos)} videos, expected one")
     return videos[0], None
 
 
 def _match_ids(ids: Sequence[object], files: Sequence[Path]) -> dict[object, int]:
-    """Position in `files` of each id: its name, its stem, or the last number in its name."""
+    """The position in `files` of each id, which is the name of the file, its stem, or the last number in it."""
     numbers = [re.findall(r"\d+", path.stem)[-1:] for path in files]
     by_name = {path.name: i for i, path in enumerate(files)} | {path.stem: i for i, path in enumerate(files)}
     by_number = {int(number[0]): i for i, number in enumerate(numbers) if number}
@@ -283,12 +293,7 @@ def _number(name: str) -> int:
 def _images(folder: Path) -> tuple[Path, ...]:
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder")
-    return tuple(sorted((p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES), key=_natural_key))
-
-
-def _natural_key(path: Path) -> list[str | int]:
-    """img2 before img10, as `read_frames` orders a folder."""
-    return [int(part) if part.isdigit() else part.lower() for part in re.split(r"([0-9]+)", path.name)]
+    return tuple(list_images(folder))
 
 
 def _image_size(source: Path, files: Sequence[Path] | None) -> tuple[int, int]:
@@ -342,15 +347,15 @@ def _read_tum_list(folder: Path, name: str) -> tuple[Array, tuple[Path, ...]]:
 
 
 def _nearest_in_time(times: Array, wanted: Array) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Row of `times` nearest to each wanted time, and whether it is near enough."""
+    """The row of `times` nearest to each of k wanted times, (k,), and whether it is within 20 ms."""
     if not len(times):
         return np.zeros(len(wanted), np.int64), np.zeros(len(wanted), np.bool_)
     nearest = np.abs(times[None, :] - wanted[:, None]).argmin(axis=1)
-    return nearest, np.abs(times[nearest] - wanted) <= _TUM_TOLERANCE
+    return nearest, np.abs(times[nearest] - wanted) <= _TUM_TOLERANCE_SECONDS
 
 
 def _from_quaternions(rows: Array) -> tuple[Array, Array]:
-    """Rotations (n, 3, 3) and centres (n, 3) of rows ``tx ty tz qx qy qz qw``, camera to world."""
+    """Rotations (n, 3, 3) and centres (n, 3) of rows ``tx ty tz qx qy qz qw``, world_from_cam."""
     norms = np.linalg.norm(rows[:, 3:], axis=1)
     if not (np.isfinite(rows).all() and (np.abs(norms - 1.0) < 1e-2).all()):
         raise InputError("the true trajectory holds values that are not finite or quaternions not of length 1")
@@ -359,13 +364,13 @@ def _from_quaternions(rows: Array) -> tuple[Array, Array]:
 
 
 def _invert(cam_from_world: Array, source: Path) -> tuple[Array, Array]:
-    """Rotations world_from_cam and centres of matrices (n, 4, 4)."""
+    """Rotations world_from_cam (n, 3, 3) and centres (n, 3) of matrices (n, 4, 4)."""
     rotations = _rotations(cam_from_world[:, :3, :3], source).transpose(0, 2, 1)
     return rotations, -np.einsum("nij,nj->ni", rotations, cam_from_world[:, :3, 3])
 
 
 def _rotations(matrices: Array, source: Path) -> Array:
-    """Proper rotations nearest to almost orthonormal matrices (n, 3, 3)."""
+    """The rotations nearest to matrices (n, 3, 3); an error if they are not nearly orthonormal."""
     rotations = np.array([nearest_rotation(m) for m in matrices]).reshape(-1, 3, 3)
     if not np.abs(rotations - matrices).max(initial=0.0) < 1e-2:
         raise InputError(f"the poses of {source} hold matrices that are not rotations")

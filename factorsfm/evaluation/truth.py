@@ -1,4 +1,4 @@
-"""A shot with its ground truth: frames, lens, poses, depth."""
+"""A shot with its ground truth: frames, lens, poses and depth."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from factorsfm.frames.folders import read_image
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.reading import read_frames
 from factorsfm.support.errors import InputError
@@ -20,30 +21,18 @@ DepthLookup = Callable[[int], NDArray[np.float32] | None]
 
 
 def no_depth(index: int) -> None:
-    """The depth look-up of a shot without depth."""
+    """The depth look-up of a shot without depth maps."""
     return None
-
-
-def read_image(path: Path) -> NDArray[np.uint8]:
-    """An image (h, w, 3) uint8 BGR.
-
-    Raises:
-        InputError: the file is missing or no image.
-    """
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if image is None:
-        raise InputError(f"{path} cannot be read as an image")
-    return np.asarray(image, np.uint8)
 
 
 @dataclass(frozen=True, slots=True)
 class DepthMaps:
-    """Depth look-up from integer image files.
+    """Depth look-up from images of integers.
 
     Attributes:
-        files: frame index -> file.
-        unit: metres per step.
-        invalid: value that, like 0, means no depth.
+        files: the file of each frame index.
+        unit: metres per grey level.
+        invalid: a grey level that means no depth, as 0 does.
     """
 
     files: Mapping[int, Path]
@@ -53,19 +42,19 @@ class DepthMaps:
     def __call__(self, index: int) -> NDArray[np.float32] | None:
         if index not in self.files:
             return None
-        steps = cv2.imread(str(self.files[index]), cv2.IMREAD_UNCHANGED)
-        if steps is None or steps.ndim != 2:
+        levels = cv2.imread(str(self.files[index]), cv2.IMREAD_UNCHANGED)
+        if levels is None or levels.ndim != 2:
             raise InputError(f"{self.files[index]} is not a depth map of one channel")
-        known = (steps != 0) & (steps != self.invalid)
-        return np.where(known, steps * np.float32(self.unit), np.nan).astype(np.float32)
+        valid = (levels != 0) & (levels != self.invalid)
+        return np.where(valid, levels * np.float32(self.unit), np.nan).astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True)
 class RawDepthMaps:
-    """Depth look-up from headerless little-endian float32 files in metres (ETH3D).
+    """Depth look-up from files of little-endian float32 values in metres without a header (ETH3D).
 
     Attributes:
-        files: frame index -> file.
+        files: the file of each frame index.
         shape: (h, w) of every map.
     """
 
@@ -81,18 +70,19 @@ class RawDepthMaps:
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """Frames of one shot with its true camera.
+    """A shot with its true lens, poses and depth.
 
     Attributes:
-        name: for tables.
+        name: name in tables.
         source: video file, or folder of the images.
         camera: the true lens (COLMAP convention: pixel centres at 0.5).
-        indices: (n,) frames with true pose, ascending: positions in the video or in `files`.
+        indices: (n,) frames with a true pose, ascending; positions in the video or in `files`.
         rotations: (n, 3, 3) true world_from_cam.
         centers: (n, 3) true camera centres, metres.
-        depth: frame index -> true z (h, w) float32 in metres, NaN = none; None for a frame without a map.
-        masks: folder of masks of what moves, or None.
-        files: the images in order, None for a video.
+        depth: gives the true z-depth of a frame index, (h, w) float32 in metres, NaN where it has none; or None if the
+            frame has no map.
+        masks: folder of masks of what moves; None if there is none.
+        files: the images in order; None for a video.
     """
 
     name: str
@@ -118,7 +108,7 @@ class Shot:
             yield Frame(index=index, image=read_image(path), name=path.name, timestamp=None)
 
     def truth(self, indices: NDArray[np.int64]) -> tuple[Array, Array]:
-        """True rotations (k, 3, 3) and centres (k, 3) of the frames (k,).
+        """True rotations world_from_cam (k, 3, 3) and camera centres (k, 3) of frame indices (k,).
 
         Raises:
             InputError: a frame has no true pose.

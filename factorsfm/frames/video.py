@@ -19,6 +19,10 @@ from factorsfm.support.errors import InputError
 
 logger = logging.getLogger(__name__)
 
+VIDEO_SUFFIXES = (
+    *(".avi", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg"),
+    *(".mpg", ".mts", ".mxf", ".ogv", ".ts", ".webm", ".wmv"),
+)
 _SEEK_FROM = 100  # frames: decoding fewer is faster than reading the packets of the whole file
 _COMPARED = 16  # frames at the start of the file whose timestamps must be those of its packets
 _SAME_MS = 1e-3  # largest difference of two equal timestamps

@@ -336,7 +336,7 @@ def test_read_colmap_refuses_bad_models(tmp_path):
     with pytest.raises(InputError, match="no registered image"):
         read_colmap(tmp_path, tmp_path)
     colmap_model(["a/1.png", "b/2.png"]).write_text(tmp_path)
-    with pytest.raises(InputError, match="lie in 2 folders"):
+    with pytest.raises(InputError, match="are in 2 folders"):
         read_colmap(tmp_path, tmp_path)
     colmap_model(["1.png", "2.png"]).write_text(tmp_path)
     write_image(tmp_path / "1.png", 0)
