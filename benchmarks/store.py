@@ -81,8 +81,8 @@ class Record:
 def cell_key(cell: Cell, data: Path) -> str:
     """Name of the record: the cell, its data, and the code that the method runs.
 
-    The code counts without comments, docstrings and layout. Baselines depend on pycolmap and their own module
-    alone, so that work on factorsfm leaves them in the cache.
+    The code counts without imports, comments, docstrings and layout. A baseline depends only on pycolmap and the module
+    of the baselines, so that other changes of factorsfm leave its records in the cache.
     """
     folder = shot_folder(data, cell.shot)
     truth = hashlib.sha256((folder / "groundtruth.txt").read_bytes() + (folder / "camera.json").read_bytes())
@@ -140,9 +140,10 @@ def _fingerprint(files: Iterable[Path]) -> str:
 
 
 def _bare_code(path: Path) -> str:
-    """Source without comments, docstrings and layout."""
+    """Source without imports, comments, docstrings and layout, so that code which only moves keeps its records."""
     tree = ast.parse(path.read_text())
     for node in ast.walk(tree):
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node, clean=False):
-            node.body = node.body[1:] or [ast.Pass()]
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+            body = node.body[1:] if ast.get_docstring(node, clean=False) else node.body
+            node.body = [part for part in body if not isinstance(part, ast.Import | ast.ImportFrom)] or [ast.Pass()]
     return ast.unparse(tree)

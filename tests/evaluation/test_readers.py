@@ -422,7 +422,7 @@ def test_damaged_images_are_reported(own_set):
     (own_set / "images" / "00001.png").write_bytes(b"no image")
     (own_set / "depth" / "00001.png").write_bytes(b"no image")
     shot = read_shot(own_set)
-    with pytest.raises(InputError, match=r"00001\.png cannot be read"):
+    with pytest.raises(InputError, match=r"00001\.png cannot be decoded"):
         list(shot.frames())
     with pytest.raises(InputError, match="not a depth map"):
         shot.depth(1)
