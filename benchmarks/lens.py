@@ -28,6 +28,7 @@ from benchmarks.inputs import NETWORK_FILES
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.noise import coordinate_sigma
 from factorsfm.adjustment.observations import Observations
+from factorsfm.adjustment.problem import ErrorModel, Free
 from factorsfm.adjustment.state import State
 from factorsfm.camera.projection import normalized_from_pixels, pixels_from_normalized, with_focal
 from factorsfm.evaluation.metrics import auc, relative_pose_errors
@@ -146,8 +147,8 @@ def focal_of_true_poses(known: factorsfm.Reconstruction, shot: Shot) -> float:
     held, options, sigma = np.ones(len(frames), bool), PolishOptions(tolerance=1e-6), 3.0
     for free in (False, True, True, True):
         adjustment = BundleAdjustment(
-            state, observations, options, sigma=sigma, fixed=held, free_focal=free, points_only=not free
-        )  # fmt: skip
+            state, observations, options, ErrorModel(sigma), free=Free(cameras=free, focal=free, held=held)
+        )
         state = adjustment.solve()
         sigma = coordinate_sigma(adjustment.reprojection_errors())
         after = Lens(np.exp(state.log_focal))

@@ -23,6 +23,7 @@ from benchmarks.run import HERE, machine
 from factorsfm import DepthModel, Frame, TrackerOptions
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.observations import Observations
+from factorsfm.adjustment.problem import ErrorModel
 from factorsfm.adjustment.state import State
 from factorsfm.camera.projection import normalized_from_pixels
 from factorsfm.evaluation.metrics import trajectory_errors
@@ -315,7 +316,7 @@ def _solve_numpy(problem: Problem) -> tuple[Array, Array, int]:
     bearing = problem.points / length[:, None]
     state = State(problem.rotation, problem.translation, bearing, 1.0 / length, np.log([problem.focal]))
     options = PolishOptions(kernel=_KERNEL, tolerance=_TOLERANCE, iterations=_ITERATIONS)
-    adjustment = BundleAdjustment(state, problem.observations, options, sigma=_PIXEL_SIGMA)
+    adjustment = BundleAdjustment(state, problem.observations, options, ErrorModel(_PIXEL_SIGMA))
     done = adjustment.solve()
     rotations = done.rotation.transpose(0, 2, 1)
     return rotations, -np.einsum("nij,nj->ni", rotations, done.translation), adjustment.iterations

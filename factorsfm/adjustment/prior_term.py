@@ -19,6 +19,7 @@ from factorsfm.adjustment.prior_weight import (
     sample_points,
     usual_weight,
 )
+from factorsfm.adjustment.problem import ErrorModel, Free
 from factorsfm.adjustment.state import State
 from factorsfm.adjustment.track_errors import TrackErrors
 from factorsfm.priors.affine import KNOWN_SHIFT_SIGMA, SCALE_SIGMA, SHIFT_SIGMA, fit_affine
@@ -146,7 +147,7 @@ def joint_problem(
     )  # fmt: skip
     state = replace(state, scale=first_scale, shift=first_shift, field=np.zeros(len(information)))
     joint = BundleAdjustment(
-        state, observations, options, sigma=sigma, fixed=fixed, prior=prior, track_errors=track_errors
+        state, observations, options, ErrorModel(sigma, track_errors), prior=prior, free=Free(held=fixed)
     )
     none = np.zeros(0)
     return joint, PriorPart(weighed.weight, values.rows, prior, none, none, none)

@@ -13,6 +13,7 @@ from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.columns import Columns
 from factorsfm.adjustment.marginals import Marginals, in_scene_unit
 from factorsfm.adjustment.observations import Observations
+from factorsfm.adjustment.problem import Free, Known
 from factorsfm.adjustment.state import State
 from factorsfm.control.fit import ControlFit, ControlResidual
 from factorsfm.control.known import KnownDistance, KnownHeight, KnownPose, LocatedControl
@@ -130,10 +131,7 @@ def solve_under_control(adjustment: BundleAdjustment, located: LocatedControl, f
     state, term, held = _start(known, adjustment.state, placed)
     options = replace(adjustment.options, point_sigma=_POINT_SIGMA, iterations=_STEPS, tolerance=_TOLERANCE)
     if known.held:
-        moved = BundleAdjustment(
-            state, adjustment.observations, options,
-            sigma=adjustment.sigma, points_only=True, track_errors=adjustment.track_errors,
-        )  # fmt: skip
+        moved = BundleAdjustment(state, adjustment.observations, options, adjustment.errors, free=Free(cameras=False))
         state = moved.solve(_POINT_STEPS)
     sizes = [float(np.linalg.norm(r)) for r in term.residuals(state)]
     typical = float(np.median(sizes)) if sizes else 0.0
@@ -143,10 +141,14 @@ def solve_under_control(adjustment: BundleAdjustment, located: LocatedControl, f
     for kernel in sorted({max(_KERNEL, 2.0 * typical), _KERNEL}, reverse=True):
         term.kernel = kernel
         solved = BundleAdjustment(
-            state, adjustment.observations, options,
-            sigma=adjustment.sigma, fixed=held, prior=adjustment.prior, control=term,
-            track_errors=adjustment.track_errors,
-        )  # fmt: skip
+            state,
+            adjustment.observations,
+            options,
+            adjustment.errors,
+            prior=adjustment.prior,
+            free=Free(held=held),
+            known=Known(control=term),
+        )
         state = solved.solve()
         logger.debug("control: kernel %.1f sigma, %d iterations", kernel, solved.iterations)
     if state.control[6] < begin - _COLLAPSE:

@@ -12,6 +12,7 @@ from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.marginals import in_scene_unit
 from factorsfm.adjustment.noise import block_inflation, coordinate_sigma
 from factorsfm.adjustment.observations import Observations
+from factorsfm.adjustment.problem import ErrorModel, Free
 from factorsfm.adjustment.state import State
 from factorsfm.camera.projection import normalized_from_pixels, pixels_from_normalized
 from factorsfm.imagesets.mapper import SetMapper
@@ -216,9 +217,9 @@ def _solved(
         observations = Observations(np.searchsorted(positions, table.frame[order]), point.reshape(-1), uv[order])
         distance = np.linalg.norm(places[points], axis=1)
         state = State(rotation, translation, places[points] / distance[:, None], 1.0 / distance, np.log([focal]))
-        start = BundleAdjustment(state, observations, _OPTIONS, sigma=1.0, fixed=held)
+        start = BundleAdjustment(state, observations, _OPTIONS, ErrorModel(1.0), free=Free(held=held))
         sigma = coordinate_sigma(start.reprojection_errors())
-        adjustment = BundleAdjustment(state, observations, _OPTIONS, sigma=sigma, fixed=held)
+        adjustment = BundleAdjustment(state, observations, _OPTIONS, ErrorModel(sigma), free=Free(held=held))
         state = adjustment.solve()
         rotation, translation = state.rotation, state.translation
         places = places.copy()
@@ -229,7 +230,7 @@ def _solved(
     # Errors that neighbours share count once.
     sigma *= float(np.sqrt(block_inflation(adjustment.reprojection_vectors(), adjustment.observations)))
     return (
-        BundleAdjustment(adjustment.state, adjustment.observations, _OPTIONS, sigma=sigma, fixed=held),
+        BundleAdjustment(adjustment.state, adjustment.observations, _OPTIONS, ErrorModel(sigma), free=Free(held=held)),
         positions,
         np.asarray(points),
     )

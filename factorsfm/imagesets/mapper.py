@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.gather import gather
+from factorsfm.adjustment.problem import ErrorModel, Free
 from factorsfm.imagesets.covisibility import common_tracks, longest_tracks, pyramid_score, track_lengths
 from factorsfm.imagesets.start import median_angle, possible_starts
 from factorsfm.mapping.depth_fallback import DepthGuidance
@@ -306,12 +307,12 @@ class SetMapper(IncrementalMapper):
         ids, points = ids[kept], points[kept]
         observations = gather([image.tracks for image in self._order], ids)
         state = state_of(self._order, points, self.focal)
-        errors = BundleAdjustment(state, observations, self._adjustment, sigma=1.0).reprojection_errors()
+        errors = BundleAdjustment(state, observations, self._adjustment, ErrorModel(1.0)).reprojection_errors()
         sigma = max(float(np.median(errors)), self.options.pixel_sigma)
         free_focal = self._refine_focal and len(self._order) >= _FOCAL_IMAGES and self._angle > _FOCAL_ANGLE_DEG
         held = np.array([image.tracks.position in self._held for image in self._order]) if self._held else None
         adjustment = BundleAdjustment(
-            state, observations, self._adjustment, sigma=sigma, free_focal=free_focal, fixed=held
+            state, observations, self._adjustment, ErrorModel(sigma), free=Free(focal=free_focal, held=held)
         )
         state = adjustment.solve()
         focal = float(np.exp(state.log_focal[0]))

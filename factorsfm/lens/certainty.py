@@ -27,11 +27,11 @@ def lens_deviations(
     groups = len(adjustment.state.log_focal)
     covariances = [*lens_covariances(adjustment), _left_out_covariance(adjustment)]
     std = np.full((len(covariances), groups + LENS_SIZE), np.nan)
-    std[:, adjustment.free_lens] = np.sqrt([c.diagonal() for c in covariances])
+    std[:, adjustment.free_optics] = np.sqrt([c.diagonal() for c in covariances])
     evidence = 0.0
     if guess is not None:
-        free = np.isin(adjustment.free_lens, groups + np.arange(LENS_SIZE)[part])
-        away = (adjustment.state.lens - guess)[adjustment.free_lens[free] - groups]
+        free = np.isin(adjustment.free_optics, groups + np.arange(LENS_SIZE)[part])
+        away = (adjustment.state.lens - guess)[adjustment.free_optics[free] - groups]
         evidence = min(float(away @ np.linalg.solve(c[np.ix_(free, free)], away)) for c in covariances)
     return std[:-1].max(0), std[-1], evidence
 
@@ -42,7 +42,7 @@ def lens_covariances(adjustment: BundleAdjustment) -> list[Array]:
     Errors that are alike for a while, or in a part of the image, or as long as a track lives, count as one. How many
     there are is seen in blocks of residuals, and in how differently the parts of the image, and the tracks, pull.
     """
-    columns = adjustment.columns.optics.start + adjustment.free_lens
+    columns = adjustment.columns.optics.start + adjustment.free_optics
     whole = adjustment.marginals().camera
     inflation = block_inflation(adjustment.reprojection_vectors(), adjustment.observations)
     o, influence = adjustment.observations, adjustment.influences(columns)

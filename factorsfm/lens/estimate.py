@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.noise import coordinate_sigma
 from factorsfm.adjustment.observations import DISTORTION, READOUT, Observations
+from factorsfm.adjustment.problem import ErrorModel, FocalPrior, Free, Known, LensPrior
 from factorsfm.adjustment.residuals import distort
 from factorsfm.adjustment.state import LENS_SIZE, State
 from factorsfm.lens.certainty import lens_deviations
@@ -66,13 +67,13 @@ def estimate_lens(
     adjustment: BundleAdjustment,
     guess: Lens,
     options: Options,
-    focal_prior: tuple[Array, Array] | None = None,
+    focal_prior: FocalPrior | None = None,
     first_focal: tuple[Array, float] | None = None,
 ) -> tuple[BundleAdjustment, LensEstimate]:
     """The lens where the shot determines it, else what was thought first; and the cameras with it.
 
     Args:
-        adjustment: converged with the guess; focal_prior: as in `BundleAdjustment`.
+        adjustment: converged with the guess; focal_prior: what is known of the focal lengths.
         first_focal: (g,) what was thought of the focal lengths first, pixels, and the relative standard deviation of
             that; None: those of the guess, which are kept where the shot determines none.
 
@@ -94,7 +95,7 @@ def estimate_lens(
 
     first, bent = guess, None
     if held:
-        focal_prior = np.log(guess.focal), np.eye(groups) / _HELD_STD**2
+        focal_prior = FocalPrior(np.log(guess.focal), np.eye(groups) / _HELD_STD**2)
     else:
         first, cost = search_lens(adjustment, guess, o)
         if bends:
@@ -131,9 +132,11 @@ def estimate_lens(
     if final is not before:
         state, observations = through(state, final.focal), renormalized(observations, before, final, group)
     settled = BundleAdjustment(
-        replace(state, lens=np.zeros(LENS_SIZE)), observations, options.polish,
-        sigma=best.adjustment.sigma if known or rough else adjustment.sigma,
-    )  # fmt: skip
+        replace(state, lens=np.zeros(LENS_SIZE)),
+        observations,
+        options.polish,
+        ErrorModel(best.adjustment.sigma if known or rough else adjustment.sigma),
+    )
     settled.solve()
     return settled, LensEstimate(
         guess, final, focal_std, shape_std if known or rough else np.full(LENS_SIZE, np.nan), misfit, known, rough
@@ -189,7 +192,7 @@ def _with_free_shape(
     starts: list[tuple[State, Observations, float, bool]],
     options: PolishOptions,
     sigmas: Array,
-    focal_prior: tuple[Array, Array] | None,
+    focal_prior: FocalPrior | None,
 ) -> tuple[BundleAdjustment, bool] | None:
     """As `_solved_as_it_moves`, from the first start (with its noise, and whether it moves) that leads to a lens."""
     for state, observations, sigma, moves in starts:
@@ -206,7 +209,7 @@ def _solved_as_it_moves(
     options: PolishOptions,
     sigma: float,
     sigmas: Array,
-    focal_prior: tuple[Array, Array] | None,
+    focal_prior: FocalPrior | None,
     *,
     moves: bool = True,
 ) -> tuple[BundleAdjustment, bool]:
@@ -214,13 +217,14 @@ def _solved_as_it_moves(
     best = solved_with_lens(state, observations, options, sigma, sigmas, moves=moves, focal_prior=focal_prior)
     if not moves:
         return best, False
-    undistorted = BundleAdjustment(best.state, best.observations, options, sigma=best.sigma)
+    undistorted = BundleAdjustment(best.state, best.observations, options, ErrorModel(best.sigma))
     motion = classify_motion(undistorted, best.observations, options)
     general = motion.kind is ShotKind.GENERAL
     if general and sigmas.any():  # the lens may have bent with a translation that is none: let it do without
         rotating = BundleAdjustment(
-            motion.rotation_only, best.observations, options, sigma=best.sigma, free_translation=False, free_focal=True,
-            focal_prior=focal_prior, lens_sigmas=sigmas,
+            motion.rotation_only, best.observations, options, ErrorModel(best.sigma),
+            free=Free(translation=False, focal=True),
+            known=Known(focal_prior, LensPrior(motion.rotation_only.lens, sigmas)),
         )  # fmt: skip
         rotating.solve()
         general = translation_gain(rotating, undistorted) > LEAST_GAIN
@@ -240,7 +244,7 @@ def solved_with_lens(
     sigmas: Array,
     *,
     moves: bool = True,
-    focal_prior: tuple[Array, Array] | None = None,
+    focal_prior: FocalPrior | None = None,
 ) -> BundleAdjustment:
     """Converged over the lens too, first at the noise that is thought, then at that of the residuals.
 
@@ -249,22 +253,21 @@ def solved_with_lens(
     Raises:
         _NotInvertible: on the way there is a lens that does not see some of the pixels.
     """
-    known = None if not state.lens.any() and not sigmas.any() else sigmas
-    for _ in range(2):
+    bends = bool(state.lens.any() or sigmas.any())
+
+    def problem(state: State, observations: Observations, sigma: float) -> BundleAdjustment:
         _check_invertible(observations)
-        problem = BundleAdjustment(
-            state, observations, options, sigma=sigma, free_translation=moves, free_focal=True,
-            focal_prior=focal_prior, lens_sigmas=known,
-        )  # fmt: skip
-        problem.solve()
-        before, after = (Lens(np.exp(s.log_focal), s.lens) for s in (state, problem.state))
-        state, observations = problem.state, renormalized(observations, before, after, state.group)
-        sigma = coordinate_sigma(problem.reprojection_errors())
-    _check_invertible(observations)
-    return BundleAdjustment(
-        state, observations, options, sigma=sigma, free_translation=moves, free_focal=True,
-        focal_prior=focal_prior, lens_sigmas=known,
-    )  # fmt: skip
+        known = Known(focal_prior, LensPrior(state.lens, sigmas) if bends else None)
+        free = Free(translation=moves, focal=True)
+        return BundleAdjustment(state, observations, options, ErrorModel(sigma), free=free, known=known)
+
+    for _ in range(2):
+        solved = problem(state, observations, sigma)
+        solved.solve()
+        before, after = (Lens(np.exp(s.log_focal), s.lens) for s in (state, solved.state))
+        state, observations = solved.state, renormalized(observations, before, after, state.group)
+        sigma = coordinate_sigma(solved.reprojection_errors())
+    return problem(state, observations, sigma)
 
 
 def _check_invertible(observations: Observations) -> None:

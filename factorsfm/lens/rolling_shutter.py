@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.observations import DISTORTION, READOUT, Observations, Sweep
+from factorsfm.adjustment.problem import ErrorModel, Free, Known, LensPrior
 from factorsfm.adjustment.residuals import by_pose, cauchy, distort, reprojection
 from factorsfm.adjustment.state import State
 from factorsfm.lens.certainty import lens_deviations
@@ -186,9 +187,13 @@ def _solved_with_readout(
 
     def problem(free: NDArray[np.bool_]) -> BundleAdjustment:
         return BundleAdjustment(
-            state, o, options.polish, sigma=adjustment.sigma, free_translation=moves,
-            free_focal=options.refine_focal_length, lens_sigmas=np.r_[shape, READOUT_SIGMA * free],
-        )  # fmt: skip
+            state,
+            o,
+            options.polish,
+            ErrorModel(adjustment.sigma),
+            free=Free(translation=moves, focal=options.refine_focal_length),
+            known=Known(lens=LensPrior(state.lens, np.r_[shape, READOUT_SIGMA * free])),
+        )
 
     step = np.abs(problem(np.array([True, True])).lens_step()[-2:])
     if step.max() < _LEAST_STEP:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.observations import Observations
+from factorsfm.adjustment.problem import ErrorModel, Known, LensPrior
 from factorsfm.adjustment.state import LENS_SIZE, State
 from factorsfm.lens.lens import Lens, renormalized, through
 from factorsfm.support.options import PolishOptions
@@ -32,7 +33,8 @@ def search_lens(
     """
     state, few = _some_frames(adjustment.state, adjustment.observations)
     options = replace(options, iterations=_SEARCH_ITERATIONS, tolerance=1e-3)
-    known = np.zeros(LENS_SIZE) if sigmas is None and guess.shape.any() else sigmas
+    shape_sigmas = np.zeros(LENS_SIZE) if sigmas is None and guess.shape.any() else sigmas
+    prior = None if shape_sigmas is None else LensPrior(guess.shape, shape_sigmas)
 
     def fit(near: State, factor: float) -> tuple[float, State]:
         focal = factor * guess.focal
@@ -42,9 +44,12 @@ def search_lens(
         if not np.isfinite(seen.xy).all():  # some pixels are seen by no ray of this lens
             return np.inf, near
         problem = BundleAdjustment(
-            replace(through(near, focal), lens=lens.shape), seen, options,
-            sigma=adjustment.sigma, lens_sigmas=known, lens_mean=guess.shape,
-        )  # fmt: skip
+            replace(through(near, focal), lens=lens.shape),
+            seen,
+            options,
+            ErrorModel(adjustment.sigma),
+            known=Known(lens=prior),
+        )
         problem.solve()
         return problem.cost(), problem.state
 

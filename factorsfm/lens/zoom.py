@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.observations import Observations
+from factorsfm.adjustment.problem import ErrorModel, FocalPrior
 from factorsfm.adjustment.state import LENS_SIZE, State
 from factorsfm.lens.certainty import lens_covariances
 from factorsfm.lens.estimate import solved_with_lens
@@ -71,7 +72,7 @@ def find_zoom(known: BundleAdjustment, guess: Lens, times: Array, options: Polis
         inverse_distance=np.full(len(state.inverse_distance), float(np.median(state.inverse_distance))),
     )
     few = replace(options, iterations=_FLAT_ITERATIONS)
-    prior = own.log_focal, _information(times, _FIRST_SPREAD) + _level(count, _TURNING_LEVEL_SIGMA)
+    prior = FocalPrior(own.log_focal, _information(times, _FIRST_SPREAD) + _level(count, _TURNING_LEVEL_SIGMA))
     turning = solved_with_lens(flat, known.observations, few, 1.0, np.zeros(LENS_SIZE), moves=False, focal_prior=prior)
     mean = own.log_focal
     turning, turning_spread = _solved(
@@ -102,14 +103,14 @@ def find_zoom(known: BundleAdjustment, guess: Lens, times: Array, options: Polis
         100 * np.expm1(change), 100 * std, evidence, spread, best.sigma, known.sigma,
     )  # fmt: skip
     found = change > _LEAST_ZOOM and min(evidence, (change / std) ** 2) > _LEAST_EVIDENCE
-    settled = BundleAdjustment(best.state, best.observations, options, sigma=best.sigma)
+    settled = BundleAdjustment(best.state, best.observations, options, ErrorModel(best.sigma))
     settled.solve()
     return Zoom(found, settled, _information(times, spread), std)
 
 
 def _at_one_scale(*problems: BundleAdjustment) -> list[BundleAdjustment]:
     """The same with the noise of the last one."""
-    return [BundleAdjustment(p.state, p.observations, p.options, sigma=problems[-1].sigma) for p in problems]
+    return [BundleAdjustment(p.state, p.observations, p.options, ErrorModel(problems[-1].sigma)) for p in problems]
 
 
 def _solved(
@@ -125,7 +126,7 @@ def _solved(
     """Converged over the change, and the spread of its acceleration, by expectation and maximisation."""
     bend, spread, level = _bend(times), _FIRST_SPREAD, _MOVING_LEVEL_SIGMA if moves else _TURNING_LEVEL_SIGMA
     for _ in range(_ROUNDS):
-        prior = mean, _information(times, spread) + _level(len(times), level)
+        prior = FocalPrior(mean, _information(times, spread) + _level(len(times), level))
         problem = solved_with_lens(
             state, observations, options, sigma, np.zeros(LENS_SIZE), moves=moves, focal_prior=prior
         )

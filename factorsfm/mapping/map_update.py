@@ -17,6 +17,7 @@ from factorsfm.adjustment.gather import gather
 from factorsfm.adjustment.noise import typical_sigma
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.prior_term import joint_problem, usual_prior
+from factorsfm.adjustment.problem import ErrorModel, Free
 from factorsfm.adjustment.state import State
 from factorsfm.graph.keyframe_graph import FactorGraph, UpdateResult
 from factorsfm.mapping.depth_fallback import DepthGuidance
@@ -213,9 +214,13 @@ def _better_focal(adjustment: BundleAdjustment, held: NDArray[np.bool_]) -> floa
     if adjustment.sigma > _LENS_SIGMA_PX:
         return None
     free = BundleAdjustment(
-        adjustment.state, adjustment.observations, _SOLVER,
-        sigma=adjustment.sigma, free_focal=True, fixed=held, prior=adjustment.prior,
-    )  # fmt: skip
+        adjustment.state,
+        adjustment.observations,
+        _SOLVER,
+        ErrorModel(adjustment.sigma),
+        prior=adjustment.prior,
+        free=Free(focal=True, held=held),
+    )
     state = free.solve(_LENS_ITERATIONS)
     focal = free.columns.log_focal
     variance = _COVARIANCE_INFLATION * float(free.marginals().camera[focal, focal].item())
@@ -303,14 +308,14 @@ def _problem(
     observations: Observations,
 ) -> tuple[BundleAdjustment, list[int]]:
     """The window's problem at the noise that its residuals show, and the rows of its frames with a prior."""
-    unit = BundleAdjustment(state, observations, _SOLVER, sigma=1.0, fixed=held)
+    unit = BundleAdjustment(state, observations, _SOLVER, ErrorModel(1.0), free=Free(held=held))
     typical = typical_sigma(unit.reprojection_errors())
     sigma = min(max(copy.options.pixel_sigma, typical), _LARGEST_SIGMA_PX)
     tracks = [image.tracks for image in window]
     affines = [image.affine for image in window]
     weighed = usual_prior(state, observations, ids, tracks, affines) if copy.options.graph_depth else None
     if weighed is None:
-        return BundleAdjustment(state, observations, _SOLVER, sigma=sigma, fixed=held), []
+        return BundleAdjustment(state, observations, _SOLVER, ErrorModel(sigma), free=Free(held=held)), []
     adjustment, part = joint_problem(state, observations, ids, tracks, weighed, sigma, _SOLVER, held)
     return adjustment, part.images.tolist()
 

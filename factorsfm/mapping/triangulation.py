@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.observations import Observations, PriorObservations
+from factorsfm.adjustment.problem import ErrorModel, Free
 from factorsfm.adjustment.residuals import camera_points, reprojection
 from factorsfm.adjustment.state import State
 from factorsfm.support.options import PolishOptions
@@ -90,7 +91,7 @@ def triangulate(
     if affine is not None:
         state = replace(state, scale=affine[:, 0], shift=affine[:, 1], field=np.zeros(1))
     options = replace(PolishOptions(), iterations=8)
-    state = BundleAdjustment(state, o, options, sigma=sigma, prior=prior, points_only=True).solve()
+    state = BundleAdjustment(state, o, options, ErrorModel(sigma), prior=prior, free=Free(cameras=False)).solve()
     error = _support(rotation, translation, o, np.c_[state.bearing, state.inverse_distance], focal, inlier_px)
     inliers = np.add.reduceat((error < inlier_px).astype(np.int64), start)
     return Triangulation(state.bearing, state.inverse_distance, inliers, angle)

@@ -8,6 +8,7 @@ import numpy as np
 
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.observations import Observations
+from factorsfm.adjustment.problem import ErrorModel, Free
 from factorsfm.adjustment.state import State
 from factorsfm.support.options import PolishOptions
 from factorsfm.support.status import ShotKind
@@ -62,8 +63,8 @@ def classify_motion(adjustment: BundleAdjustment, observations: Observations, op
         ),
         observations,
         replace(options, iterations=6, tolerance=1e-2),
-        sigma=adjustment.sigma,
-        free_translation=False,
+        ErrorModel(adjustment.sigma),
+        free=Free(translation=False),
     )
     rotation_only.solve()
     gain = translation_gain(rotation_only, adjustment)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.noise import FIRST_SIGMA_PX, block_inflation, coordinate_sigma, image_cells
 from factorsfm.adjustment.observations import Observations
+from factorsfm.adjustment.problem import ErrorModel, Free
 from factorsfm.adjustment.state import State
 from factorsfm.motion.burn_ins import contradicts, resting
 from factorsfm.support.options import Options, PolishOptions
@@ -54,7 +55,7 @@ def converge_cameras(start: State, few: Observations, options: Options) -> tuple
 def _better(known: BundleAdjustment, other: BundleAdjustment) -> BundleAdjustment:
     """The other solution where it fits clearly better, at one scale of the errors: a median alone may be chance."""
     cost, other_cost = (
-        BundleAdjustment(b.state, b.observations, b.options, sigma=known.sigma).cost() for b in (known, other)
+        BundleAdjustment(b.state, b.observations, b.options, ErrorModel(known.sigma)).cost() for b in (known, other)
     )
     return other if other_cost < _CLEARLY * cost else known
 
@@ -62,23 +63,21 @@ def _better(known: BundleAdjustment, other: BundleAdjustment) -> BundleAdjustmen
 def converge(part: State, few: Observations, options: Options) -> BundleAdjustment:
     """Converged from one start, first with a wide kernel."""
     o = options.polish
-    errors = BundleAdjustment(part, few, o, sigma=1.0).reprojection_errors()
+    errors = BundleAdjustment(part, few, o, ErrorModel(1.0)).reprojection_errors()
     sigma = max(FIRST_SIGMA_PX, coordinate_sigma(errors))
-    adjustment = BundleAdjustment(part, few, replace(o, iterations=20, tolerance=1e-3), sigma=sigma)
+    adjustment = BundleAdjustment(part, few, replace(o, iterations=20, tolerance=1e-3), ErrorModel(sigma))
     adjustment.solve()
     iterations, measured = adjustment.iterations, coordinate_sigma(adjustment.reprojection_errors())
     while True:
         # A wide kernel averages over outliers and lets go early: what it finds counts once the kernel fits the errors.
         sigma = min(sigma, measured)
-        adjustment = BundleAdjustment(adjustment.state, few, o, sigma=sigma)
+        adjustment = BundleAdjustment(adjustment.state, few, o, ErrorModel(sigma))
         adjustment.solve()
         iterations, measured = iterations + adjustment.iterations, coordinate_sigma(adjustment.reprojection_errors())
         if measured > _SETTLED * sigma:
             break
     logger.debug("cameras: %d iterations, %.3f px", iterations, measured)
-    adjustment.state = in_front(adjustment.state)
-    adjustment.sigma = measured
-    return adjustment
+    return BundleAdjustment(in_front(adjustment.state), few, o, ErrorModel(measured))
 
 
 def _flat(part: State, few: Observations, options: PolishOptions) -> State:
@@ -88,7 +87,9 @@ def _flat(part: State, few: Observations, options: PolishOptions) -> State:
         translation=np.zeros_like(part.translation),
         inverse_distance=np.full(len(part.inverse_distance), float(np.median(part.inverse_distance))),
     )
-    rotating = BundleAdjustment(still, few, replace(options, iterations=15), sigma=1.0, free_translation=False)
+    rotating = BundleAdjustment(
+        still, few, replace(options, iterations=15), ErrorModel(1.0), free=Free(translation=False)
+    )
     return rotating.solve()
 
 

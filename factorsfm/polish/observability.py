@@ -72,10 +72,7 @@ def _prior_shares(adjustment: BundleAdjustment, marginals: Marginals) -> tuple[A
         return np.zeros(k), np.zeros(k)
     none = np.zeros(0)
     state = replace(state, scale=none, shift=none, field=none)
-    alone = BundleAdjustment(
-        state, adjustment.observations, adjustment.options,
-        sigma=adjustment.sigma, track_errors=adjustment.track_errors,
-    ).marginals()  # fmt: skip
+    alone = BundleAdjustment(state, adjustment.observations, adjustment.options, adjustment.errors).marginals()
     weights = scene_weights(marginals, state)
     both, geometry = (
         np.einsum("kii->ki", pose_blocks(in_scene(m, state, weights), k))[:, 3:] for m in (marginals, alone)

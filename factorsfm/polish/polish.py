@@ -15,6 +15,7 @@ from factorsfm.adjustment.marginals import in_scene_unit
 from factorsfm.adjustment.noise import SMALLEST_SIGMA_PX, coordinate_sigma
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.prior_term import PriorPart, joint_problem
+from factorsfm.adjustment.problem import ErrorModel, Free
 from factorsfm.adjustment.residuals import cauchy
 from factorsfm.adjustment.state import State
 from factorsfm.adjustment.track_errors import TrackErrors, measure_track_errors
@@ -174,7 +175,7 @@ def polish(
         )
     else:
         adjustment = BundleAdjustment(
-            state, observations, final, sigma=scale * wide, free_translation=free, track_errors=errors
+            state, observations, final, ErrorModel(scale * wide, errors), free=Free(translation=free)
         )
     adjustment.solve(o.final_iterations)
     marginals = adjustment.marginals()
@@ -209,7 +210,7 @@ def _with_track_errors(
     state: State, observations: Observations, sigma: float, free: bool, options: PolishOptions
 ) -> tuple[State, TrackErrors]:
     """The tracks without the prior, and how far their errors persist, which shows where the cameras fit them all."""
-    adjustment = BundleAdjustment(state, observations, options, sigma=sigma, free_translation=free)
+    adjustment = BundleAdjustment(state, observations, options, ErrorModel(sigma), free=Free(translation=free))
     adjustment.solve(_FIRST_ITERATIONS)
     return adjustment.state, measure_track_errors(adjustment.reprojection_vectors(), observations, options.kernel)
 
@@ -248,7 +249,7 @@ def _fit_to_recorded_images(result: Polished, shutter: Shutter, options: PolishO
     moves = result.motion.kind is ShotKind.GENERAL
     result.state = replace(seen_at_once(result.state, recorded, weight, moves=moves), world=-1).seen_from(0)
     result.observations, result.recorded = recorded, True
-    result.errors = BundleAdjustment(result.state, recorded, options, sigma=result.sigma).reprojection_errors()
+    result.errors = BundleAdjustment(result.state, recorded, options, ErrorModel(result.sigma)).reprojection_errors()
     result.sigma = coordinate_sigma(result.errors)
 
 
@@ -343,5 +344,5 @@ def _add_frames_between(
     rows = np.searchsorted(frames, np.array(registered)[seen.frame[kept]])
     result.observations = seen.at(kept, frame=rows)
     result.errors = BundleAdjustment(
-        result.state, result.observations, options.polish, sigma=result.sigma
+        result.state, result.observations, options.polish, ErrorModel(result.sigma)
     ).reprojection_errors()

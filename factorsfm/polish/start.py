@@ -12,6 +12,7 @@ from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.noise import FIRST_SIGMA_PX, block_inflation
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.prior_term import WeighedPrior, weigh_prior
+from factorsfm.adjustment.problem import ErrorModel, FocalPrior, Free
 from factorsfm.adjustment.state import State
 from factorsfm.lens.estimate import estimate_lens
 from factorsfm.lens.lens import Lens, LensEstimate
@@ -104,7 +105,9 @@ def polish_start(
     progress("polish: points")
     sigma = adjustment.sigma
     state = with_all_points(part, adjustment.state, observations, core)
-    state = BundleAdjustment(state, observations, replace(o, iterations=4), sigma=sigma, points_only=True).solve()
+    state = BundleAdjustment(
+        state, observations, replace(o, iterations=4), ErrorModel(sigma), free=Free(cameras=False)
+    ).solve()
     if o.observation_sigmas is None:
         observations, tracks, state = _without_outliers(state, observations, tracks, sigma, o)
     else:
@@ -188,7 +191,7 @@ def _estimate_lens(
         adjustment, lens = estimate_lens(adjustment, guess, options, first_focal=first_focal)
         return adjustment, replace(lens, zoom_std=zoom.std if zoom else None)
     zoomed = Lens(np.exp(zoom.adjustment.state.log_focal), guess.shape)
-    prior = np.zeros(len(frames)), zoom.information
+    prior = FocalPrior(np.zeros(len(frames)), zoom.information)
     adjustment, lens = estimate_lens(zoom.adjustment, zoomed, options, prior)
     seen = Lens(np.repeat(guess.focal, len(frames)), guess.shape)
     return adjustment, replace(lens, guess=seen, zoom_std=zoom.std)
@@ -214,7 +217,7 @@ def _without_outliers(
     state: State, observations: Observations, tracks: Index, sigma: float, options: PolishOptions
 ) -> tuple[Observations, Index, State]:
     """Drop tracks whose typical error is far outside that of all tracks (log scale, robust)."""
-    errors = BundleAdjustment(state, observations, options, sigma=sigma).reprojection_errors()
+    errors = BundleAdjustment(state, observations, options, ErrorModel(sigma)).reprojection_errors()
     typical = np.log(np.sqrt(observations.mean_by_point(errors**2)) + 1e-6)
     center = np.median(typical)
     spread = 1.4826 * np.median(np.abs(typical - center))
@@ -226,7 +229,7 @@ def _without_outlying_observations(
     state: State, observations: Observations, tracks: Index, limit_px: float, options: PolishOptions
 ) -> tuple[Observations, Index, State]:
     """Drop wrong matches one by one, and tracks of which less than two observations remain."""
-    good = BundleAdjustment(state, observations, options, sigma=1.0).reprojection_errors() < limit_px
+    good = BundleAdjustment(state, observations, options, ErrorModel(1.0)).reprojection_errors() < limit_px
     good &= np.bincount(observations.point, good, len(tracks))[observations.point] >= 2
     keep = np.unique(observations.point[good])
     return observations.at(good).of(keep), tracks[keep], state.of(keep)

@@ -7,6 +7,7 @@ from gtsam.symbol_shorthand import A, L, T, X
 
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment, _newton_step
 from factorsfm.adjustment.observations import Observations
+from factorsfm.adjustment.problem import ErrorModel, FocalPrior, Free, Known
 from factorsfm.graph.factors import (
     affine_of_native,
     camera_from_pose,
@@ -85,7 +86,7 @@ def test_the_optimum_is_that_of_gtsam(motion):
     prior, truth = with_prior(problem, [0, 2, 5])
     prior = replace(prior, node_weights=np.zeros_like(prior.node_weights))
     start = start_of(truth)
-    adjustment = BundleAdjustment(start, problem.observations, EXACT, sigma=0.3, prior=prior)
+    adjustment = BundleAdjustment(start, problem.observations, EXACT, ErrorModel(0.3), prior=prior)
     state = adjustment.solve()
     cost, rotation, translation, affines = gtsam_optimum(problem, prior, start, 0.3, EXACT.kernel)
     # What is left is the model error x / VIRTUAL_BASELINE of the native depth factor.
@@ -106,7 +107,7 @@ def test_the_gradient_is_that_of_the_cost(kernel):
     state = replace(perturbed(truth), log_focal=truth.log_focal + 0.01)
     options = PolishOptions(kernel=kernel, point_sigma=0.1)
     adjustment = BundleAdjustment(
-        start_of(truth), problem.observations, options, sigma=0.5, prior=prior, free_focal=True
+        start_of(truth), problem.observations, options, ErrorModel(0.5), prior=prior, free=Free(focal=True)
     )
     adjustment.state = state  # away from where the priors of the points are anchored
     normal = adjustment._linearize()
@@ -135,7 +136,7 @@ def test_the_step_solves_the_whole_system():
     problem = make_problem("arc", frames=4, points=30, parallax=0.2, noise_px=0.5)
     prior, truth = with_prior(problem, [1, 2], smooth=0.1)
     adjustment = BundleAdjustment(
-        start_of(truth), problem.observations, PolishOptions(), sigma=0.5, prior=prior, free_focal=True
+        start_of(truth), problem.observations, PolishOptions(), ErrorModel(0.5), prior=prior, free=Free(focal=True)
     )
     normal = adjustment._linearize()
     c, n = len(normal.camera_gradient), len(problem.points)
@@ -175,7 +176,7 @@ def test_the_step_solves_the_whole_system():
 @pytest.mark.parametrize("motion", ["dolly", "truck", "handheld", "arc"])
 def test_noise_free_shots_are_recovered_exactly(motion):
     problem = make_problem(motion)
-    adjustment = BundleAdjustment(perturbed(problem.truth), problem.observations, EXACT, sigma=0.25)
+    adjustment = BundleAdjustment(perturbed(problem.truth), problem.observations, EXACT, ErrorModel(0.25))
     state = adjustment.solve()
     assert_cameras(state, problem.truth, angle_rad=1e-6, distance=1e-6)
     assert np.median(adjustment.reprojection_errors()) < 1e-5
@@ -185,14 +186,14 @@ def test_noise_free_shots_are_recovered_exactly(motion):
 
 def test_the_default_options_come_within_their_weak_prior():
     problem = make_problem("handheld", parallax=0.03)
-    adjustment = BundleAdjustment(perturbed(problem.truth), problem.observations, PolishOptions(), sigma=0.25)
+    adjustment = BundleAdjustment(perturbed(problem.truth), problem.observations, PolishOptions(), ErrorModel(0.25))
     assert_cameras(adjustment.solve(), problem.truth, angle_rad=2e-5, distance=1e-4)
 
 
 def test_pure_rotation_without_translation():
     problem = make_problem("rotation")
     start = perturbed(problem.truth, shift=0.0)
-    adjustment = BundleAdjustment(start, problem.observations, EXACT, sigma=0.25, free_translation=False)
+    adjustment = BundleAdjustment(start, problem.observations, EXACT, ErrorModel(0.25), free=Free(translation=False))
     state = adjustment.solve()
     assert angles_between(state.rotation, problem.truth.rotation).max() < 1e-7
     np.testing.assert_array_equal(state.translation, start.translation)
@@ -203,7 +204,7 @@ def test_pure_rotation_without_translation():
 def test_translation_is_held_where_asked():
     problem = make_problem("truck")
     start = perturbed(problem.truth)
-    adjustment = BundleAdjustment(start, problem.observations, EXACT, sigma=0.25, free_translation=False)
+    adjustment = BundleAdjustment(start, problem.observations, EXACT, ErrorModel(0.25), free=Free(translation=False))
     state = adjustment.solve()
     turned = state.rotation @ np.swapaxes(start.rotation, 1, 2)
     # The camera turns about its own centre.
@@ -217,11 +218,11 @@ def test_the_focal_length_is_recovered(factor):
     o = problem.observations
     guess = replace(perturbed(problem.truth), log_focal=problem.truth.log_focal + np.log(factor))
     normalized = Observations(o.frame, o.point, o.xy / factor)
-    adjustment = BundleAdjustment(guess, normalized, EXACT, sigma=0.25, free_focal=True)
+    adjustment = BundleAdjustment(guess, normalized, EXACT, ErrorModel(0.25), free=Free(focal=True))
     state = adjustment.solve()
     assert np.exp(state.log_focal) == pytest.approx(problem.focal, rel=1e-5)
     assert_cameras(state, problem.truth, angle_rad=1e-5, distance=1e-5)
-    held = BundleAdjustment(guess, normalized, EXACT, sigma=0.25)
+    held = BundleAdjustment(guess, normalized, EXACT, ErrorModel(0.25))
     assert held.solve().log_focal == guess.log_focal
     assert held.cost() > 100 * adjustment.cost() + 1.0
 
@@ -233,12 +234,12 @@ def test_groups_of_focal_lengths_are_recovered():
     factor = np.array([0.93, 1.05, 1.1])
     guess = replace(perturbed(problem.truth), log_focal=problem.truth.log_focal + np.log(factor), group=group)
     normalized = Observations(o.frame, o.point, o.xy / factor[group[o.frame], None])
-    adjustment = BundleAdjustment(guess, normalized, EXACT, sigma=0.25, free_focal=True)
+    adjustment = BundleAdjustment(guess, normalized, EXACT, ErrorModel(0.25), free=Free(focal=True))
     state = adjustment.solve()
     np.testing.assert_allclose(np.exp(state.log_focal), problem.focal, rtol=1e-5)
     np.testing.assert_array_equal(state.group, group)
     assert_cameras(state, problem.truth, angle_rad=1e-5, distance=1e-5)
-    held = BundleAdjustment(guess, normalized, EXACT, sigma=0.25)
+    held = BundleAdjustment(guess, normalized, EXACT, ErrorModel(0.25))
     np.testing.assert_array_equal(held.solve().log_focal, guess.log_focal)
 
 
@@ -254,9 +255,9 @@ def test_what_is_known_of_the_focal_lengths_holds_them_together():
             truth,
             problem.observations,
             EXACT,
-            sigma=0.3,
-            free_focal=True,
-            focal_prior=(truth.log_focal, step.T @ step / sigma**2),
+            ErrorModel(0.3),
+            free=Free(focal=True),
+            known=Known(focal=FocalPrior(truth.log_focal, step.T @ step / sigma**2)),
         )
         spreads.append(np.ptp(adjustment.solve().log_focal))
     assert spreads[0] > 1e-3
@@ -267,7 +268,9 @@ def test_points_only_holds_the_cameras():
     problem = make_problem("truck")
     prior, truth = with_prior(problem, [0, 4], noise=0.0)
     start = replace(start_of(truth, angle_rad=0.0, shift=0.0), scale=truth.scale, shift=truth.shift)
-    adjustment = BundleAdjustment(start, problem.observations, EXACT, sigma=0.25, prior=prior, points_only=True)
+    adjustment = BundleAdjustment(
+        start, problem.observations, EXACT, ErrorModel(0.25), prior=prior, free=Free(cameras=False)
+    )
     state = adjustment.solve()
     for name in ("rotation", "translation", "log_focal", "scale", "shift", "field"):
         np.testing.assert_array_equal(getattr(state, name), getattr(start, name))
@@ -277,7 +280,7 @@ def test_points_only_holds_the_cameras():
 def test_the_prior_gives_depth_where_geometry_has_none():
     problem = make_problem("static", noise_px=0.1)
     prior, truth = with_prior(problem, [0, 5, 9], noise=0.01, scale_std=0.01, shift_std=0.01)
-    adjustment = BundleAdjustment(start_of(truth), problem.observations, PolishOptions(), sigma=0.1, prior=prior)
+    adjustment = BundleAdjustment(start_of(truth), problem.observations, PolishOptions(), ErrorModel(0.1), prior=prior)
     state = in_unit_of(adjustment.solve(), truth)
     assert np.abs(state.inverse_distance - truth.inverse_distance).max() < 0.05
     assert np.abs(adjustment.prior_residuals()).max() < 0.06
@@ -286,11 +289,11 @@ def test_the_prior_gives_depth_where_geometry_has_none():
 
 def test_outliers_hardly_move_the_solution():
     problem = make_problem("handheld", points=150, noise_px=0.1)
-    clean = BundleAdjustment(perturbed(problem.truth), problem.observations, EXACT, sigma=0.1).solve()
+    clean = BundleAdjustment(perturbed(problem.truth), problem.observations, EXACT, ErrorModel(0.1)).solve()
     rng = np.random.default_rng(5)
     wild = rng.random(len(problem.observations.xy)) < 0.05
     problem.observations.xy[wild] += rng.normal(0, 0.03, (wild.sum(), 2))
-    robbed = BundleAdjustment(perturbed(problem.truth), problem.observations, EXACT, sigma=0.1)
+    robbed = BundleAdjustment(perturbed(problem.truth), problem.observations, EXACT, ErrorModel(0.1))
     state = robbed.solve()
     assert_cameras(clean, problem.truth, angle_rad=5e-4, distance=2e-3)
     assert_cameras(state, problem.truth, angle_rad=5e-4, distance=2e-3)
@@ -300,7 +303,7 @@ def test_outliers_hardly_move_the_solution():
 def test_reprojection_vectors_are_predicted_minus_observed():
     problem = make_problem("truck")
     problem.observations.xy[3] += [0.01, -0.02]
-    adjustment = BundleAdjustment(problem.truth, problem.observations, EXACT, sigma=0.25)
+    adjustment = BundleAdjustment(problem.truth, problem.observations, EXACT, ErrorModel(0.25))
     expected = np.zeros((len(problem.observations.xy), 2))
     expected[3] = -problem.focal * np.array([0.01, -0.02])
     np.testing.assert_allclose(adjustment.reprojection_vectors(), expected, atol=1e-8)
@@ -311,7 +314,7 @@ def test_unsorted_observations_are_refused():
     problem = make_problem("truck")
     o = problem.observations
     with pytest.raises(ValueError, match="sorted by point"):
-        BundleAdjustment(problem.truth, Observations(o.frame[::-1], o.point[::-1], o.xy[::-1]), EXACT, sigma=0.25)
+        BundleAdjustment(problem.truth, Observations(o.frame[::-1], o.point[::-1], o.xy[::-1]), EXACT, ErrorModel(0.25))
 
 
 # --- uncertainty ------------------------------------------------------------------------------------------------
@@ -331,7 +334,7 @@ def test_the_covariance_is_calibrated():
         start = replace(
             start_of(truth, seed, angle_rad=0.001, shift=0.003), inverse_distance=truth.inverse_distance + anchor_error
         )
-        adjustment = BundleAdjustment(start, problem.observations, options, sigma=0.3, prior=prior)
+        adjustment = BundleAdjustment(start, problem.observations, options, ErrorModel(0.3), prior=prior)
         state = adjustment.solve()
         some = np.arange(0, n, 5)
         marginals = adjustment.marginals()
@@ -361,7 +364,7 @@ def test_the_covariance_is_calibrated_up_to_the_unit(motion):
         problem = make_problem(motion, frames=5, points=40, parallax=0.1, noise_px=0.3, seed=seed)
         truth = problem.truth
         start = perturbed(truth, seed, angle_rad=0.001, shift=0.003)
-        adjustment = BundleAdjustment(start, problem.observations, PolishOptions(), sigma=0.3)
+        adjustment = BundleAdjustment(start, problem.observations, PolishOptions(), ErrorModel(0.3))
         state = in_unit_of(adjustment.solve(), truth)
         some = np.arange(0, len(problem.points), 5)
         marginals = adjustment.marginals()
@@ -380,7 +383,9 @@ def test_covariance_of_the_focal_length():
     options = PolishOptions(kernel=1e6, tolerance=1e-6)
     for seed in range(40):
         problem = make_problem("arc", frames=5, points=40, parallax=0.3, noise_px=0.2, seed=seed)
-        adjustment = BundleAdjustment(problem.truth, problem.observations, options, sigma=0.2, free_focal=True)
+        adjustment = BundleAdjustment(
+            problem.truth, problem.observations, options, ErrorModel(0.2), free=Free(focal=True)
+        )
         state = adjustment.solve()
         camera = adjustment.marginals().camera
         errors.append(state.log_focal[0] - problem.truth.log_focal[0])

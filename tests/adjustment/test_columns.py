@@ -8,9 +8,9 @@ import pytest
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.columns import Columns
 from factorsfm.adjustment.marginals import in_scene_unit
+from factorsfm.adjustment.problem import ErrorModel, Free, Known, LensPrior
 from factorsfm.support.options import PolishOptions
-from tests.adjustment.test_bundle_adjustment import with_prior
-from tests.estimation_problems import make_problem
+from tests.estimation_problems import make_problem, with_prior
 
 
 def test_every_variable_has_one_column():
@@ -33,13 +33,18 @@ def test_in_the_unit_of_the_scene_it_is_no_matter_how_well_the_unit_is_known(unk
     """The scale of the prior's affines is the unit: known to 10 % or not at all, with lens columns before it or not."""
     problem = make_problem("arc", frames=6, points=80, parallax=0.3, noise_px=0.2)
     prior, truth = with_prior(problem, [0, 2, 5], smooth=0.05)
-    sigmas = np.array([0.1, 0.1, 0.01, 0.01, 0.0, 0.0]) if unknown_lens else None
+    sigmas = np.array([0.1, 0.1, 0.01, 0.01, 0.0, 0.0])
     found = []
     for scale_sigma in (0.1, 100.0):
         adjustment = BundleAdjustment(
-            truth, problem.observations, PolishOptions(point_sigma=1e4), sigma=0.2,
-            prior=replace(prior, scale_sigma=scale_sigma), free_focal=unknown_lens, lens_sigmas=sigmas,
-        )  # fmt: skip
+            truth,
+            problem.observations,
+            PolishOptions(point_sigma=1e4),
+            ErrorModel(0.2),
+            prior=replace(prior, scale_sigma=scale_sigma),
+            free=Free(focal=unknown_lens),
+            known=Known(lens=LensPrior(truth.lens, sigmas) if unknown_lens else None),
+        )
         marginals, columns = adjustment.marginals(), adjustment.columns
         relative = in_scene_unit(marginals, truth)
         found.append([np.sqrt(c.diagonal()[columns.scales]) for c in (marginals.camera, relative)])

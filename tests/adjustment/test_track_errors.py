@@ -5,6 +5,7 @@ import pytest
 
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.observations import Observations
+from factorsfm.adjustment.problem import ErrorModel
 from factorsfm.adjustment.track_errors import STRETCH, measure_track_errors
 from factorsfm.support.options import PolishOptions
 from tests.estimation_problems import angles_between, in_unit_of, make_problem
@@ -58,7 +59,7 @@ def problem_with_persistent_errors(shot, size, seed=0):
     error[::50] += 2.0  # outliers
     seen = with_errors(shot, error)
     errors = measure_track_errors(error, seen, 2.0)
-    return BundleAdjustment(shot.truth, seen, OPTIONS, sigma=errors.sigma, track_errors=errors)
+    return BundleAdjustment(shot.truth, seen, OPTIONS, ErrorModel(errors.sigma, errors))
 
 
 def test_the_gradient_is_that_of_the_cost(shot):
@@ -80,7 +81,7 @@ def test_the_gradient_is_that_of_the_cost(shot):
 
 def test_the_normal_equations_are_those_of_the_dense_information_matrix(shot):
     adjustment = problem_with_persistent_errors(shot, 0.3)
-    errors, normal = adjustment.track_errors, adjustment._linearize()
+    errors, normal = adjustment.errors.tracks, adjustment._linearize()
     term, c = normal.terms[0], adjustment.columns.size
     m = len(term.point)
     jacobian = np.zeros((2, m, c + 3 * len(shot.points)))
@@ -110,10 +111,10 @@ def test_cameras_are_better_and_their_covariance_is_honest(shot):
     for seed in range(6):
         rng = np.random.default_rng([seed, 5])
         seen = with_errors(shot, drawn(shot.observations, 0.5 * rng.choice([0.05, 1.0], len(shot.points)), seed))
-        plain = BundleAdjustment(shot.truth, seen, OPTIONS, sigma=WHITE)
+        plain = BundleAdjustment(shot.truth, seen, OPTIONS, ErrorModel(WHITE))
         plain.solve()
         errors = measure_track_errors(plain.reprojection_vectors(), seen, 100.0)
-        aware = BundleAdjustment(plain.state, seen, OPTIONS, sigma=errors.sigma, track_errors=errors)
+        aware = BundleAdjustment(plain.state, seen, OPTIONS, ErrorModel(errors.sigma, errors))
         aware.solve()
         for adjustment, collected in ((plain, worse), (aware, better)):
             state = in_unit_of(adjustment.state, shot.truth)
@@ -127,9 +128,9 @@ def test_cameras_are_better_and_their_covariance_is_honest(shot):
 def test_without_what_persists_the_weights_are_those_of_the_kernel(shot):
     o = shot.observations
     seen = with_errors(shot, drawn(o, np.zeros(len(shot.points))))
-    plain = BundleAdjustment(shot.truth, seen, OPTIONS, sigma=WHITE)
+    plain = BundleAdjustment(shot.truth, seen, OPTIONS, ErrorModel(WHITE))
     errors = measure_track_errors(plain.reprojection_vectors(), seen, OPTIONS.kernel)
     independent = replace(errors, sigma=WHITE, shared=np.zeros_like(errors.shared))
-    weighted = BundleAdjustment(shot.truth, seen, OPTIONS, sigma=WHITE, track_errors=independent)
+    weighted = BundleAdjustment(shot.truth, seen, OPTIONS, ErrorModel(WHITE, independent))
     expected, found = plain._linearize(), weighted._linearize()
     np.testing.assert_allclose(found.camera, expected.camera, rtol=0.05, atol=0.02 * np.abs(expected.camera).max())

@@ -28,6 +28,7 @@ from factorsfm import (
 )
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.marginals import in_scene_unit
+from factorsfm.adjustment.problem import ErrorModel, Known
 from factorsfm.adjustment.state import State
 from factorsfm.cli import main as cli
 from factorsfm.control.known import LocatedControl, locate
@@ -86,7 +87,9 @@ def linear_point() -> tuple[Problem, State, ControlTerm]:
 @pytest.mark.parametrize("number", range(8))
 def test_each_residual_has_the_derivative_of_its_value(number: int) -> None:
     problem, state, term = linear_point()
-    adjustment = BundleAdjustment(state, problem.observations, PolishOptions(), sigma=1.0, control=term)
+    adjustment = BundleAdjustment(
+        state, problem.observations, PolishOptions(), ErrorModel(1.0), known=Known(control=term)
+    )
     item = term.items[number]
     residual, columns, derivative = item.linearized(term.view(state))
     assert derivative.shape == (len(residual), len(columns))
@@ -105,7 +108,9 @@ def test_each_residual_has_the_derivative_of_its_value(number: int) -> None:
 
 def test_the_gradient_of_the_adjustment_is_that_of_its_cost() -> None:
     problem, state, term = linear_point()
-    adjustment = BundleAdjustment(state, problem.observations, PolishOptions(), sigma=0.5, control=term)
+    adjustment = BundleAdjustment(
+        state, problem.observations, PolishOptions(), ErrorModel(0.5), known=Known(control=term)
+    )
     normal = adjustment._linearize()
     n, size = len(state.bearing), len(normal.camera_gradient)
     assert size == 6 * 5 + 2 + 6 + DATUM + 9
@@ -123,7 +128,9 @@ def test_the_gradient_of_the_adjustment_is_that_of_its_cost() -> None:
 def test_the_control_does_not_know_the_unit_of_the_polish() -> None:
     """Cameras, marked points and datum, carried along with the unit, leave every residual but the marks' as it is."""
     problem, state, term = linear_point()
-    adjustment = BundleAdjustment(state, problem.observations, PolishOptions(), sigma=1.0, control=term)
+    adjustment = BundleAdjustment(
+        state, problem.observations, PolishOptions(), ErrorModel(1.0), known=Known(control=term)
+    )
     seen: dict[str, np.ndarray] = {}
 
     def relative(motion: np.ndarray, measured: np.ndarray) -> np.ndarray:

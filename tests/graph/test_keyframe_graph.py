@@ -16,6 +16,7 @@ from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.gather import gather
 from factorsfm.adjustment.prior_term import WeighedPrior, joint_problem
 from factorsfm.adjustment.prior_weight import PriorWeight
+from factorsfm.adjustment.problem import ErrorModel, Free
 from factorsfm.adjustment.state import State
 from factorsfm.graph.keyframe_graph import FactorGraph
 from factorsfm.support.options import PolishOptions
@@ -54,7 +55,7 @@ class Shot:
         fixed, o = np.arange(len(frames)) < held, gather([image.tracks for image in window], ids)
         guided = [k for k in frames if self.images[k].tracks.depth is not None]
         if not guided:
-            return BundleAdjustment(state, o, options, sigma=SIGMA, fixed=fixed), []
+            return BundleAdjustment(state, o, options, ErrorModel(SIGMA), free=Free(held=fixed)), []
         scale, shift = np.array([self.images[k].affine or (1.0, 0.0) for k in guided]).T
         rows = np.array([list(frames).index(k) for k in guided])
         weighed = WeighedPrior(GOOD_PRIOR, rows, scale, shift, 1.0)

@@ -10,6 +10,7 @@ from factorsfm import api
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.noise import image_cells
 from factorsfm.adjustment.observations import Observations, Sweep
+from factorsfm.adjustment.problem import ErrorModel, FocalPrior, Free, Known, LensPrior
 from factorsfm.adjustment.residuals import distort
 from factorsfm.adjustment.state import LENS_SIZE
 from factorsfm.camera.guess import guess_camera
@@ -78,9 +79,13 @@ def test_the_gradient_of_the_lens_columns_is_that_of_the_cost(kernel, group):
     random = np.random.default_rng(1).standard_normal((3, len(problem.observations.xy), 2))
     observations = replace(problem.observations, sweep=Sweep(20.0 * random[0], 5.0 * random[1], random[2]))
     adjustment = BundleAdjustment(
-        start, observations, options, sigma=0.5, free_focal=True, lens_sigmas=sigmas,
-        focal_prior=(focal + 0.1, information),
-    )  # fmt: skip
+        start,
+        observations,
+        options,
+        ErrorModel(0.5),
+        free=Free(focal=True),
+        known=Known(focal=FocalPrior(focal + 0.1, information), lens=LensPrior(start.lens, sigmas)),
+    )
     adjustment.state = replace(
         start, lens=start.lens + 0.01, log_focal=start.log_focal + 0.01 * np.arange(1, groups + 1)
     )
@@ -318,7 +323,7 @@ def test_the_search_sees_through_distortion_where_it_may():
     problem = make_problem("arc", frames=10, points=200, parallax=0.1, noise_px=0.05)
     seen = replace(problem.observations, xy=distort(problem.observations.xy, STRONG_BARREL)[0])
     guess = Lens(np.array([problem.focal]))
-    adjustment = BundleAdjustment(problem.truth, seen, PolishOptions(), sigma=0.2)
+    adjustment = BundleAdjustment(problem.truth, seen, PolishOptions(), ErrorModel(0.2))
     straight, cost = search_lens(adjustment, guess, PolishOptions())
     bent, bent_cost = search_lens(adjustment, guess, PolishOptions(), np.array([0.1, 0.1, 0.0, 0.0, 0.0, 0.0]))
     assert not straight.shape.any()

@@ -10,6 +10,7 @@ import pytest
 from factorsfm import Frame, reconstruct
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.observations import READOUT, Observations
+from factorsfm.adjustment.problem import ErrorModel
 from factorsfm.adjustment.state import State
 from factorsfm.lens.lens import Lens, renormalized, through
 from factorsfm.lens.rolling_shutter import Recording, seen_at_once, with_sweep
@@ -147,7 +148,9 @@ def test_poses_of_the_recorded_images_show_the_points_where_the_images_do():
     np.testing.assert_allclose(recorded.state.translation[0], 0.0, atol=1e-12)
     rows = np.isin(problem.observations.point, recorded.tracks)
     np.testing.assert_allclose(recorded.observations.xy, problem.observations.xy[rows], atol=1e-9)  # what was measured
-    shown = BundleAdjustment(rolling.state, recorded.observations, PolishOptions(), sigma=1.0).reprojection_errors()
+    shown = BundleAdjustment(
+        rolling.state, recorded.observations, PolishOptions(), ErrorModel(1.0)
+    ).reprojection_errors()
     assert 0.5 < np.sqrt(np.mean(recorded.errors**2) / np.mean(shown**2)) < 0.95
     # No camera without a rolling shutter shows all points there, and this one shows them better than any near it.
     for axis in range(6):
@@ -160,7 +163,9 @@ def test_poses_of_the_recorded_images_show_the_points_where_the_images_do():
                 rotation=turn @ recorded.state.rotation,
                 translation=np.einsum("ij,kj->ki", turn, recorded.state.translation) + nudge[3:],
             )
-            other = BundleAdjustment(state, recorded.observations, PolishOptions(), sigma=1.0).reprojection_errors()
+            other = BundleAdjustment(
+                state, recorded.observations, PolishOptions(), ErrorModel(1.0)
+            ).reprojection_errors()
             assert (other**2).sum() > (recorded.errors**2).sum()
 
 

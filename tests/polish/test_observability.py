@@ -9,6 +9,7 @@ import pytest
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.marginals import in_scene, in_scene_unit, scene_weights
 from factorsfm.adjustment.observations import Observations
+from factorsfm.adjustment.problem import ErrorModel
 from factorsfm.motion.shot_kind import classify_motion, displacement
 from factorsfm.polish.observability import (
     CameraObservability,
@@ -33,7 +34,7 @@ OPTIONS = PolishOptions()
 def classified(problem):
     """The motion of a shot, after cameras and points have converged with the noise that the shot has."""
     start = perturbed(problem.truth, angle_rad=1e-3, shift=1e-3)
-    adjustment = BundleAdjustment(start, problem.observations, OPTIONS, sigma=problem.noise_px)
+    adjustment = BundleAdjustment(start, problem.observations, OPTIONS, ErrorModel(problem.noise_px))
     adjustment.solve()
     return classify_motion(adjustment, problem.observations, OPTIONS)
 
@@ -121,7 +122,7 @@ def test_outliers_do_not_make_a_tripod_move():
 
 def test_the_adjustment_is_left_as_it_was():
     problem = shot("truck")
-    adjustment = BundleAdjustment(problem.truth, problem.observations, OPTIONS, sigma=0.1)
+    adjustment = BundleAdjustment(problem.truth, problem.observations, OPTIONS, ErrorModel(0.1))
     state = adjustment.solve()
     before = replace(state, rotation=state.rotation.copy(), translation=state.translation.copy())
     classify_motion(adjustment, problem.observations, OPTIONS)
@@ -134,7 +135,7 @@ def test_a_last_camera_that_has_lost_its_observations():
     o = problem.observations
     kept = o.frame != problem.frames - 1
     rest = replace(o, frame=o.frame[kept], point=o.point[kept], xy=o.xy[kept])
-    adjustment = BundleAdjustment(problem.truth, rest, OPTIONS, sigma=0.1)
+    adjustment = BundleAdjustment(problem.truth, rest, OPTIONS, ErrorModel(0.1))
     last = observed(adjustment)[-1]
     assert (len(observed(adjustment)), np.isnan(last.triangulation_angle_deg)) == (problem.frames, True)
 
@@ -153,7 +154,7 @@ def shares(motion, parallax, *, noise=0.02, smooth=0.02, affine_std=0.02):
     prior, truth = with_prior(
         problem, [0, 5, 11], noise=noise, smooth=smooth, scale_std=affine_std, shift_std=affine_std
     )
-    cameras = observed(BundleAdjustment(truth, problem.observations, OPTIONS, sigma=0.2, prior=prior))
+    cameras = observed(BundleAdjustment(truth, problem.observations, OPTIONS, ErrorModel(0.2), prior=prior))
     return np.array([(c.prior_share, c.prior_share_view_axis) for c in cameras]).T
 
 
@@ -175,7 +176,7 @@ def test_a_prior_that_knows_little_has_a_small_share():
 
 def test_without_a_prior_its_share_is_zero():
     problem = make_problem("truck", noise_px=0.2)
-    cameras = observed(BundleAdjustment(problem.truth, problem.observations, OPTIONS, sigma=0.2))
+    cameras = observed(BundleAdjustment(problem.truth, problem.observations, OPTIONS, ErrorModel(0.2)))
     assert [(c.prior_share, c.prior_share_view_axis) for c in cameras] == [(0.0, 0.0)] * problem.frames
 
 
@@ -183,7 +184,7 @@ def test_a_prior_without_weight_adds_nothing():
     problem = make_problem("handheld", noise_px=0.2)
     prior, truth = with_prior(problem, [0, 9])
     prior = replace(prior, sigma=np.full_like(prior.sigma, 1e6))
-    cameras = observed(BundleAdjustment(truth, problem.observations, OPTIONS, sigma=0.2, prior=prior))
+    cameras = observed(BundleAdjustment(truth, problem.observations, OPTIONS, ErrorModel(0.2), prior=prior))
     assert max(c.prior_share for c in cameras) < 1e-6
 
 
@@ -201,13 +202,13 @@ def solutions(motion, noise_px=0.3):
     for seed in range(TRIALS):
         noise = np.random.default_rng([seed, 5]).standard_normal(problem.observations.xy.shape)
         noisy = replace(problem.observations, xy=problem.observations.xy + noise_px / problem.focal * noise)
-        adjustment = BundleAdjustment(problem.truth, noisy, GAUSSIAN, sigma=noise_px)
+        adjustment = BundleAdjustment(problem.truth, noisy, GAUSSIAN, ErrorModel(noise_px))
         state = adjustment.solve()
         unit = state.inverse_distance.mean() / problem.truth.inverse_distance.mean()
         found.append(
             replace(state, translation=state.translation * unit, inverse_distance=state.inverse_distance / unit)
         )
-    exact = BundleAdjustment(problem.truth, problem.observations, GAUSSIAN, sigma=noise_px)
+    exact = BundleAdjustment(problem.truth, problem.observations, GAUSSIAN, ErrorModel(noise_px))
     return problem, found, exact
 
 

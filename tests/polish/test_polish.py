@@ -7,6 +7,7 @@ import pytest
 
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.observations import Observations
+from factorsfm.adjustment.problem import ErrorModel
 from factorsfm.polish.camera_starts import converge_cameras, in_front
 from factorsfm.polish.connected_frames import connected_frames
 from factorsfm.polish.polish import polish
@@ -105,7 +106,7 @@ def test_a_solution_under_a_wide_kernel_is_solved_again():
     options = Options.preset_named("geometry")
     _, best = converge_cameras(problem.truth, seen, options)
     _, found = converge_cameras(bent(problem.truth), seen, options)
-    costs = [BundleAdjustment(b.state, seen, options.polish, sigma=0.05).cost() for b in (best, found)]
+    costs = [BundleAdjustment(b.state, seen, options.polish, ErrorModel(0.05)).cost() for b in (best, found)]
     assert costs[1] == pytest.approx(costs[0], rel=0.01)
     assert found.sigma == pytest.approx(0.05, rel=0.3)
 
