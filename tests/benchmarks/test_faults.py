@@ -1,4 +1,4 @@
-"""The benchmark of faults: what it injects, and that it would see what must not be."""
+"""The benchmark of faults: what it injects, and that it would see what must not happen."""
 
 import json
 
@@ -6,8 +6,10 @@ import numpy as np
 import pycolmap
 import pytest
 
-from benchmarks import faults
-from benchmarks.faults import KILLED, KINDS, Item, Material, Outcome, Plan
+from benchmarks.faults.__main__ import report
+from benchmarks.faults.plan import Fault, FaultyPrior, KnownShot, Plan, PlannedFrame, disturbed, random_plan
+from benchmarks.faults.run import Outcome
+from benchmarks.faults.verdict import last_saved, wrong_updates
 from benchmarks.live import sigmas
 from factorsfm import Frame
 from factorsfm.support.similarity import pose_arrays
@@ -17,51 +19,51 @@ FRAMES = 20
 
 
 @pytest.fixture
-def shots() -> list[Material]:
+def shots() -> list[KnownShot]:
     """Grey images whose value is the number of the frame; 100 more in the second shot."""
     scene = synthetic_scene("truck", FRAMES)
     truth = pose_arrays(scene.cam_from_world)
     depth = [np.ones((9, 16), np.float32)] * FRAMES
     return [
-        Material([np.full((18, 32, 3), first + k, np.uint8) for k in range(FRAMES)], depth, scene.camera, *truth)
+        KnownShot([np.full((18, 32, 3), first + k, np.uint8) for k in range(FRAMES)], depth, scene.camera, *truth)
         for first in (0, 100)
     ]
 
 
-def items(shots: list[Material]) -> list[Item]:
-    return [Item(image, (0, k)) for k, image in enumerate(shots[0].images)]
+def planned(shots: list[KnownShot]) -> list[PlannedFrame]:
+    return [PlannedFrame(image, (0, k)) for k, image in enumerate(shots[0].images)]
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("fault", Fault)
 @pytest.mark.parametrize("seed", range(5))
-def test_what_is_injected_is_known(shots, kind, seed):
-    before = items(shots)
-    found = faults._disturbed(kind, before, shots, np.random.default_rng(seed))
+def test_what_is_injected_is_known(shots, fault, seed):
+    before = planned(shots)
+    found = disturbed(fault, before, shots, np.random.default_rng(seed))
     assert len(found) >= 10
-    for item in found:
-        if item.origin is not None and kind != faults.DAMAGED:
-            shot, k = item.origin
-            assert item.image[0, 0, 0] == 100 * shot + k
+    for frame in found:
+        if frame.origin is not None and fault is not Fault.DAMAGED:
+            shot, k = frame.origin
+            assert frame.image[0, 0, 0] == 100 * shot + k
     unchanged = len(found) == FRAMES and all(a is b for a, b in zip(found, before, strict=True))
-    assert unchanged == (kind == KILLED)
-    prior = faults.Prior(Plan([kind], shots, found))
-    for k, item in enumerate(found):
-        if item.depth == "raise":
+    assert unchanged == (fault is Fault.KILLED)
+    prior = FaultyPrior(Plan([fault], shots, found))
+    for k, frame in enumerate(found):
+        if frame.depth_fault == "raise":
             with pytest.raises(RuntimeError):
-                prior(Frame(k, item.image, ""))
+                prior(Frame(k, frame.image, ""))
         else:
-            assert np.isnan(prior(Frame(k, item.image, "")).values).all() == (item.depth == "nan")
+            assert np.isnan(prior(Frame(k, frame.image, "")).values).all() == (frame.depth_fault == "nan")
 
 
 def test_plans_are_those_of_their_seed(monkeypatch, shots):
-    monkeypatch.setattr("benchmarks.faults._rendered", lambda *_, **__: shots[0])
+    monkeypatch.setattr("benchmarks.faults.plan._rendered_shot", lambda *_, **__: shots[0])
     for seed in range(10):
-        one, other = faults.plan(seed, None), faults.plan(seed, None)
-        assert one.kinds == other.kinds
-        assert 1 <= len(set(one.kinds)) == len(one.kinds) <= 3
-        assert (one.kill, one.delay, one.film) == (other.kill, other.delay, other.film)
-        assert (one.kill is None) == (KILLED not in one.kinds)
-        for a, b in zip(one.items, other.items, strict=True):
+        one, other = random_plan(seed, None), random_plan(seed, None)
+        assert one.faults == other.faults
+        assert 1 <= len(set(one.faults)) == len(one.faults) <= 3
+        assert (one.killed_at, one.kill_delay, one.is_film) == (other.killed_at, other.kill_delay, other.is_film)
+        assert (one.killed_at is None) == (Fault.KILLED not in one.faults)
+        for a, b in zip(one.frames, other.frames, strict=True):
             np.testing.assert_array_equal(a.image, b.image)
 
 
@@ -84,7 +86,7 @@ def test_errors_in_standard_deviations(shots):
     assert np.nanmax(np.delete(off, 5)) < 0.1
 
 
-def line(index: int, shot: Material, k: int, shift: float = 0.0, number: int = 0, *, anew: bool = False) -> str:
+def line(index: int, shot: KnownShot, k: int, shift: float = 0.0, number: int = 0, *, anew: bool = False) -> str:
     pose = pycolmap.Rigid3d(pycolmap.Rotation3d(shot.rotations[k]), shot.centers[k] + [0.0, shift, 0.0]).inverse()
     covariance = np.diag([1e-6] * 6).tolist()
     content = {"index": index, "shot": number, "pose": pose.matrix().tolist(), "covariance": covariance}
@@ -92,39 +94,37 @@ def line(index: int, shot: Material, k: int, shift: float = 0.0, number: int = 0
 
 
 def test_wrong_poses_are_seen(shots, tmp_path):
-    log, made = tmp_path / "updates.jsonl", Plan([], shots, items(shots))
+    log, plan = tmp_path / "updates.jsonl", Plan([], shots, planned(shots))
     good = [line(k, shots[0], k) for k in range(FRAMES)]
     log.write_text("\n".join([*good, '{"saved": 12}', '{"index": 3, "sh']))
-    assert faults._wrong_updates(log, made) == []
-    assert faults._last_saved(log) == 12
-    log.write_text("\n".join([*good, line(7, shots[0], 7, 0.02)]))  # the newest word on a frame counts
-    (fault,) = faults._wrong_updates(log, made)
+    assert wrong_updates(log, plan) == []
+    assert last_saved(log) == 12
+    log.write_text("\n".join([*good, line(7, shots[0], 7, 0.02)]))  # the newest update of a frame counts
+    (fault,) = wrong_updates(log, plan)
     assert fault.startswith("frame 7 is off by 20.")
-    made.items[4] = Item(made.items[4].image, None)
-    made.items[6] = Item(shots[1].images[0], (1, 0))
+    plan.frames[4] = PlannedFrame(plan.frames[4].image, None)
+    plan.frames[6] = PlannedFrame(shots[1].images[0], (1, 0))
     log.write_text("\n".join(good))
-    assert faults._wrong_updates(log, made) == [
-        f"frame {k} has a pose, but shows nothing of the shot" for k in (4, 6)
-    ]  # fmt: skip
+    assert wrong_updates(log, plan) == [f"frame {k} has a pose, but shows nothing of the shot" for k in (4, 6)]
 
 
 def test_what_was_declared_void_is_not_wrong(shots, tmp_path):
-    log, made = tmp_path / "updates.jsonl", Plan([], shots, items(shots))
-    made.items[0] = Item(made.items[0].image, None)
+    log, plan = tmp_path / "updates.jsonl", Plan([], shots, planned(shots))
+    plan.frames[0] = PlannedFrame(plan.frames[0].image, None)
     for anew, wrong in ((2, []), (0, ["frame 0 has a pose, but shows nothing of the shot"])):
         log.write_text("\n".join(line(k, shots[0], k, anew=k == anew) for k in range(FRAMES)))
-        assert faults._wrong_updates(log, made) == wrong
+        assert wrong_updates(log, plan) == wrong
 
 
 def test_every_kind_of_end_is_counted():
     outcomes = {
         0: Outcome(["black frames"], "40 of 40 frames"),
-        1: Outcome(["black frames", KILLED], "", ["hangs: no end within 300 s"]),
-        2: Outcome([KILLED], "0 of 9 frames registered, at least 2 needed"),
-        3: Outcome([KILLED], "9 of 9 frames", ["frame 3 is off by 9.0 sigma"]),
-        4: Outcome([KILLED], "", ["crashes with status -11: "]),
+        1: Outcome(["black frames", Fault.KILLED], "", ["hangs: no end within 300 s"]),
+        2: Outcome([Fault.KILLED], "0 of 9 frames registered, at least 2 needed"),
+        3: Outcome([Fault.KILLED], "9 of 9 frames", ["frame 3 is off by 9.0 sigma"]),
+        4: Outcome([Fault.KILLED], "", ["crashes with status -11: "]),
     }
-    text = faults.report(outcomes)
+    text = report(outcomes)
     assert "| black frames | 2 | 1 | 0 | 1 | 0 | 0 |" in text
     assert "| SIGKILL and resume | 4 | 1 | 1 | 1 | 1 | 1 |" in text
     assert "| all runs | 5 | 2 | 1 | 1 | 1 | 1 |" in text
