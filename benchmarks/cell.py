@@ -1,6 +1,6 @@
-"""Measure one cell in a process of its own: ``python -m benchmarks.cell < job.json``.
+"""Measures one cell in a process of its own: ``python -m benchmarks.cell < job.json``.
 
-The job names the cell, the folders `data`, `models`, `cache`, and `record`, the file to write.
+The job names the cell, the folders `data`, `models` and `cache`, and the file to write, `record`.
 """
 
 from __future__ import annotations
@@ -33,13 +33,19 @@ from factorsfm.support.similarity import pose_arrays
 
 Array = NDArray[np.float64]
 
-_MOST_DEPTHS = 10_000  # of the observed points, drawn at random: enough for shares of them, and small to keep
-CODE_CHANGED = 3  # exit code: the job was written for other code than that of this process
+_MOST_DEPTHS = 10_000  # depths of observed points that are kept, a random sample; enough to compute shares
+CODE_CHANGED = 3  # exit status: the job was written by other code than that of this process
 
 
 @dataclass(frozen=True, slots=True)
 class Folders:
-    """Attributes: data: the sets; models: the networks; cache: records and what is made once."""
+    """The folders of a run.
+
+    Attributes:
+        data: the sets.
+        models: the networks.
+        cache: the records, and simulated priors and matches that several cells share.
+    """
 
     data: Path
     models: Path
@@ -48,13 +54,17 @@ class Folders:
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """What a method made of the frames: poses as in `metrics`, and its points as observed in them.
+    """The result of a method: poses as in `evaluation.metrics`, and the observations of its points.
 
     Attributes:
-        indices: (n,); rotations: (n, 3, 3); centers: (n, 3).
-        frame: (m,) row in `indices` of each observation; xy: (m, 2) pixels; depth: (m,) z in that camera.
+        indices: (n,) of the frames.
+        rotations: (n, 3, 3) world_from_cam.
+        centers: (n, 3) camera centres.
+        frame: (m,) row in `indices` of each observation.
+        xy: (m, 2) pixels.
+        depth: (m,) z-depth of the point in that camera.
         facts: see `Record.facts`.
-        given: rotations and centres as they were given frame by frame, where the method gives them.
+        given: rotations and centres of the causal poses; None if the method has none.
     """
 
     indices: NDArray[np.int64]
@@ -68,7 +78,7 @@ class Estimate:
 
 
 def measure(cell: Cell, folders: Folders) -> Record:
-    """Run the method of a cell and judge its result. Whatever it raises becomes a record with the reason."""
+    """Run the method of a cell and compare its result with the truth; an exception becomes a record with the reason."""
     load = os.getloadavg()[0]
     shot = open_shot(folders.data, cell.shot, cell.variant)
     try:
@@ -84,7 +94,7 @@ def measure(cell: Cell, folders: Folders) -> Record:
 
 
 def judge(cell: Cell, shot: Shot, estimate: Estimate) -> Record:
-    """The estimate beside the truth: frames without an estimated pose are NaN."""
+    """The record of an estimate and the truth; frames without an estimated pose are NaN."""
     n = len(shot.indices)
     rotations, centers = np.full((n, 3, 3), np.nan), np.full((n, 3), np.nan)
     _, rows, found = np.intersect1d(shot.indices, estimate.indices, return_indices=True)
@@ -109,7 +119,7 @@ def judge(cell: Cell, shot: Shot, estimate: Estimate) -> Record:
 
 
 def unregistered(cell: Cell, shot: Shot, reason: str) -> Record:
-    """The record of a method that failed: no frame is registered."""
+    """The record of a method that failed, without registered frames."""
     n = len(shot.indices)
     facts = {"failed": reason, "seconds": {}}
     return _record(cell, shot, np.full((n, 3, 3), np.nan), np.full((n, 3), np.nan), facts, np.empty(0), np.empty(0))
@@ -131,13 +141,13 @@ def _record(
 
 
 def true_parallax(shot: Shot) -> float | None:
-    """Parallax as the paper defines it, from the true path and the true depth maps; None without such maps."""
+    """The paper's parallax, from the true path and the true depth maps; None if there are no maps."""
     maps = [depth[::4, ::4].ravel() for i in shot.indices if (depth := shot.depth(int(i))) is not None]
     return parallax(shot.centers, np.concatenate(maps)) if maps else None
 
 
 def _factorsfm(cell: Cell, shot: Shot, folders: Folders) -> Estimate:
-    """Our method, timed from the opened source to the written result."""
+    """Our method, timed from the open source to the written result."""
     options = Options.preset_named(cell.method)
     if (tracks := VARIANTS[cell.variant].max_tracks) is not None:
         options = replace(options, tracker=replace(options.tracker, max_tracks=tracks))
@@ -185,7 +195,7 @@ def _estimate(result: Reconstruction, seconds: Mapping[str, float], given: tuple
 
 
 def _baseline(cell: Cell, shot: Shot, folders: Folders) -> Estimate:
-    """A COLMAP mapper on matches that all mappers of the shot share."""
+    """A mapper of COLMAP, on the matches that all its mappers share."""
     matches, matching = _matches(cell, shot, folders)
     before = cpu_seconds()
     result = getattr(baselines, cell.method)(matches)
@@ -207,14 +217,16 @@ def _baseline(cell: Cell, shot: Shot, folders: Folders) -> Estimate:
 
 
 def matches_folder(cell: Cell, folders: Folders) -> Path:
-    """Where the matches of a shot wait for the next mapper; the runner deletes it after the last, with what is left
-    of attempts that were stopped."""
+    """The folder of the matches of a shot for all mappers of COLMAP.
+
+    The runner deletes it after the last mapper, with folders beside it that interrupted attempts have left.
+    """
     anchor = replace(cell, method=COLMAP[0])
     return folders.cache / "matches" / f"{cell.shot}.{cell.variant}.{cell_key(anchor, folders.data)}"
 
 
 def _matches(cell: Cell, shot: Shot, folders: Folders) -> tuple[baselines.Matches, dict[str, float]]:
-    """The shared matches with CPU seconds and peak memory of their making."""
+    """The shared matches, and the CPU seconds and the peak memory that they took."""
     folder = matches_folder(cell, folders)
     if not folder.is_dir():
         folder.parent.mkdir(parents=True, exist_ok=True)

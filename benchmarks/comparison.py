@@ -1,4 +1,4 @@
-"""Where the default leads and where it does not: against its own variants, and against COLMAP."""
+"""Comparisons of the default, shot by shot: with its own variants and with COLMAP."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from benchmarks.scores import Records, parallax_of, pose_aucs
 from benchmarks.store import Record
 
 POSE = ("ATE 0.2 cm", "ATE 2 cm", "T-RPE 0.1 cm", "T-RPE 0.5 cm", "R-RPE 0.02°", "R-RPE 0.1°")
+_BEHIND = -3.0  # points of AUC, below which the default counts as behind
 
 
 def _others(shot: str, variant: str, prior: str) -> list[tuple[str, str, str, str]]:
-    """Against what `default` is measured: shot, variant, method and prior."""
+    """The cells with which `default` is compared: shot, variant, method and prior."""
     return [(shot, variant, "geometry", "none"), (shot, variant, "paper", prior)]
 
 
@@ -33,7 +34,7 @@ def no_harm(experiments: Mapping[str, Records]) -> list[str]:
     if not rows:
         return []
     rows.sort(key=lambda row: row[-1])
-    behind = sum(row[-1] < -3.0 for row in rows)
+    behind = sum(row[-1] < _BEHIND for row in rows)
     header = ["experiment", "shot", "variant", "prior", *POSE, "worst"]
     return [
         "## Default against the better of geometry and paper",
@@ -43,7 +44,7 @@ def no_harm(experiments: Mapping[str, Records]) -> list[str]:
 
 
 def luck(experiments: Mapping[str, Records]) -> list[str]:
-    """The same where the footage was measured several times, with faint noise of other seeds: of the means."""
+    """The same for the means of footage that was measured several times, with faint noise of different seeds."""
     draws: dict[tuple[str, str, str, str], dict[int, list[float]]] = {}
     for record in (record for records in experiments.values() for record in records):
         variant, draw = undrawn(record.cell.variant)
@@ -62,10 +63,10 @@ def luck(experiments: Mapping[str, Records]) -> list[str]:
     if not rows:
         return []
     rows.sort(key=lambda row: row[-1])
-    behind = sum(row[-1] < -3.0 for row in rows)
+    behind = sum(row[-1] < _BEHIND for row in rows)
     header = ["shot", "variant", "prior", "draws", *POSE, "largest deviation of a draw", "worst"]
     return [
-        "### How much of that is luck",
+        "### How much of that is chance",
         "The same footage several times, each time with noise of half a grey level from another seed, so that other "
         "tracks survive: the mean of the default against the better of the means of geometry and paper, and the "
         "largest standard deviation of a single draw in a column. "
@@ -75,7 +76,7 @@ def luck(experiments: Mapping[str, Records]) -> list[str]:
 
 
 def against_colmap(experiments: Mapping[str, Records]) -> list[str]:
-    """`default` against the best of COLMAP's mappers on the same frames, by the median error of the position."""
+    """`default` against the best of COLMAP's mappers on the same frames, by the median ATE."""
     rows: list[list[Any]] = []
     for name, records in experiments.items():
         colmap: dict[tuple[str, str], list[Record]] = {}
@@ -85,8 +86,8 @@ def against_colmap(experiments: Mapping[str, Records]) -> list[str]:
         for record in records:
             rivals = colmap.get((record.cell.shot, record.cell.variant))
             if record.cell.method == "default" and rivals:
-                best = min(rivals, key=_typical)
-                ours, theirs = _typical(record), _typical(best)
+                best = min(rivals, key=_median_ate)
+                ours, theirs = _median_ate(record), _median_ate(best)
                 rows.append(
                     [
                         *(name, record.cell.shot, record.cell.variant, record.cell.prior),
@@ -99,13 +100,13 @@ def against_colmap(experiments: Mapping[str, Records]) -> list[str]:
         return []
     rows.sort(key=lambda row: row[-1])
     ratios = np.array([row[-1] for row in rows])
-    beaten = np.isfinite(ratios)
-    leads, tellable = int((ratios > 1).sum()), int(beaten.sum())
+    both = np.isfinite(ratios)
+    leads = int((ratios > 1).sum())
     text = (
-        "Median ATE, shot by shot, and how many times as large that of the best of COLMAP's mappers is, chosen "
-        f"knowing the truth; where the default is behind comes first. It leads in {leads} of {len(rows)}, by a factor "
-        f"of {np.median(ratios[beaten]):.1f} in the median of the {tellable} in which one of them registers half of "
-        "the frames."
+        "Median ATE of the default and of the best of COLMAP's mappers, which is chosen with the truth, and the ratio "
+        "of the latter to the former; the smallest ratios come first. The default leads in "
+        f"{leads} of {len(rows)}, by a factor of {np.median(ratios[both]):.1f} in the median over the "
+        f"{int(both.sum())} in which a mapper of COLMAP registers half of the frames."
     )
     header = ["experiment", "shot", "variant", "prior", "parallax", "default, mm", "best of COLMAP", "its mm", "ratio"]
     for row in rows:
@@ -113,8 +114,8 @@ def against_colmap(experiments: Mapping[str, Records]) -> list[str]:
     return ["## Default against the best of COLMAP", text, table(header, rows)]
 
 
-def _typical(record: Record) -> float:
-    """Median ATE, metres; infinite where half of the frames are missing."""
+def _median_ate(record: Record) -> float:
+    """Median ATE, metres; infinite if half of the frames are not registered."""
     return float(np.median(record.errors.ate))
 
 

@@ -1,4 +1,4 @@
-"""A film of six shots, reconstructed as a batch: ``python -m benchmarks.episode --data FOLDER``."""
+"""A film of six shots, reconstructed by `factorsfm batch`: ``python -m benchmarks.episode --data FOLDER``."""
 
 from __future__ import annotations
 
@@ -41,8 +41,9 @@ SHOTS = (
     "d07_keep_pan_trans_actor",
     "d08_arena_pedestal",
 )
-_FADE = 10  # frames of a fade out, and of the one in
-_BLACK = 5
+_FADE_FRAMES = 10  # of a fade out, and of a fade in
+_BLACK_FRAMES = 5  # between them
+_FRAMES_PER_SECOND = 24
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +51,8 @@ class Part:
     """A shot in the film.
 
     Attributes:
-        frames: its own ones. before, after: frames of a fade that show its end or beginning as a still; 0 at a cut.
+        frames: the frames of the film that are its own.
+        before, after: number of frames of a fade that show its first or last image; 0 at a cut.
     """
 
     shot: Shot
@@ -60,31 +62,36 @@ class Part:
 
     @property
     def middle(self) -> int:
-        """Its middle frame."""
+        """Its middle frame in the film."""
         return self.frames[len(self.frames) // 2]
 
     def is_found(self, found: range) -> bool:
-        """Whether these are its frames: at a cut to the frame, at a fade somewhere in it."""
+        """Whether a range of frames has its boundaries: at a cut exactly, at a fade anywhere in it."""
         early, late = self.frames.start - found.start, found.stop - self.frames.stop
         return 0 <= early <= self.before and 0 <= late <= self.after
 
 
 def write_film(shots: Sequence[Shot], limit: int | None, folder: Path) -> list[Part]:
-    """Join the shots to ``film.avi``, without loss, and their masks; after every second one there is a fade."""
+    """Write the shots to ``film.avi``, coded without loss, and their masks; after every second shot there is a fade.
+
+    Args:
+        limit: most frames of a shot; None for all.
+    """
     (folder / "masks").mkdir()
     video: cv2.VideoWriter | None = None
     parts = []
     written = 0
     for number, shot in enumerate(shots):
         images = [frame.image for frame in islice(shot.frames(), limit)]
-        before = _FADE if number and number % 2 == 0 else 0
-        after = _FADE if number % 2 and number + 1 < len(shots) else 0
+        before = _FADE_FRAMES if number and number % 2 == 0 else 0
+        after = _FADE_FRAMES if number % 2 and number + 1 < len(shots) else 0
         start = written + before
         parts.append(Part(shot, range(start, start + len(images)), before, after))
         for image in _with_fades(images, before, after):
             if video is None:
                 size = image.shape[1], image.shape[0]
-                video = cv2.VideoWriter(str(folder / "film.avi"), cv2.VideoWriter.fourcc(*"FFV1"), 24, size)
+                codec = cv2.VideoWriter.fourcc(*"FFV1")
+                video = cv2.VideoWriter(str(folder / "film.avi"), codec, _FRAMES_PER_SECOND, size)
             video.write(image)
             written += 1
         if shot.masks is not None:
@@ -102,7 +109,7 @@ def _with_fades(images: Sequence[Image], before: int, after: int) -> Iterator[Im
     for k in range(after):
         yield _dimmed(images[-1], 1.0 - (k + 1) / (after + 1))
     if after:
-        yield from [np.zeros_like(images[-1])] * _BLACK
+        yield from [np.zeros_like(images[-1])] * _BLACK_FRAMES
 
 
 def _dimmed(image: Image, light: float) -> Image:
@@ -111,7 +118,13 @@ def _dimmed(image: Image, light: float) -> Image:
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """A run of the command: processes, cores that they may use; seconds on the wall, and of all cores."""
+    """A run of the command.
+
+    Attributes:
+        workers: number of processes.
+        cores: number of cores that they may use.
+        wall, computing: wall time and CPU time, seconds.
+    """
 
     workers: int
     cores: int
@@ -120,7 +133,7 @@ class Batch:
 
 
 def run_batch(folder: Path, output: str, network: Path, workers: int, cores: Sequence[int]) -> Batch:
-    """Run the command on some cores."""
+    """Run the command on these cores, with its results in a subfolder `output`."""
     command = [sys.executable, "-m", "factorsfm", "batch", str(folder / "film.avi"), "--output", str(folder / output)]
     command += ["--depth", str(network), "--workers", str(workers)]
     if any((folder / "masks").iterdir()):
@@ -131,7 +144,7 @@ def run_batch(folder: Path, output: str, network: Path, workers: int, cores: Seq
 
 
 def median_ate(reconstruction: Reconstruction, shot: Shot, frames: range) -> float:
-    """In metres, over these frames of the reconstruction, of which the first is the shot's."""
+    """Median ATE, metres, over a range of frames of the reconstruction that begins with the first frame of the shot."""
     own = [frame for frame in reconstruction.frames if frame.index in frames]
     truth = shot.truth(np.array([frame.index - frames.start for frame in own]))
     errors = trajectory_errors(*pose_arrays([frame.cam_from_world for frame in own]), *truth)
@@ -139,7 +152,7 @@ def median_ate(reconstruction: Reconstruction, shot: Shot, frames: range) -> flo
 
 
 def measure(shots: Sequence[Shot], limit: int | None, network: Path, folder: Path) -> list[str]:
-    """The parts of the page."""
+    """Reconstruct the film in three ways and each shot by itself; returns the sections of the page."""
     parts = write_film(shots, limit, folder)
     found = find_shots(folder / "film.avi")
     right = len(found) == len(parts) and all(part.is_found(f) for part, f in zip(parts, found, strict=True))
@@ -165,10 +178,11 @@ def measure(shots: Sequence[Shot], limit: int | None, network: Path, folder: Pat
     frames, runs = sum(len(part.frames) for part in parts), (alone, whole, full)
     return [
         "## Shots",
-        f"Boundaries, {'all' if right else 'NOT all'} as they are: at cuts to the frame, at fades within the "
-        f"{_FADE} frames that hold the shot's first or last image. Median ATE in mm, of a shot that is reconstructed "
-        f"from its own file, in the film by one worker, and by {many}. The film is coded without loss, but in other "
-        "colours than the files, and a faded shot has some still frames more, so equal numbers are not expected.",
+        f"Boundaries, {'all' if right else 'NOT all'} correct: exact at cuts, at fades within the {_FADE_FRAMES} "
+        "frames that show the first or last image of the shot. Median ATE in mm of a shot that is reconstructed from "
+        f"its own file, in the film by one worker, and in the film by {many}. The film is coded without loss, but in "
+        "another colour space than the files, and a shot beside a fade has more still frames, so that the numbers "
+        "differ.",
         table(
             ["shot", "frames", "found", "own file", "1 worker", f"{many} workers", f"{many} workers / own file"],
             rows,
@@ -179,16 +193,15 @@ def measure(shots: Sequence[Shot], limit: int | None, network: Path, folder: Pat
             ["workers", "cores", "seconds", "of computing on all cores", "frames per second"],
             [[b.workers, b.cores, f"{b.wall:.1f}", f"{b.computing:.1f}", f"{frames / b.wall:.2f}"] for b in runs],
         ),
-        f"{many} workers with a core each, as `batch` starts them by itself, are **{alone.wall / full.wall:.2f}** "
-        "times as fast as one worker that has one core: the same kind of worker, once and on the whole machine. A "
-        "single one with all cores does several things at a time, tracking beside the graph and the decoder, and so "
-        f"uses most of them already: {many} workers are {whole.wall / full.wall:.2f} times as fast as that. Start, the "
-        "search for cuts and the last shots, which have no company, are included.",
+        f"{many} workers with a core each, the default of `batch`, are **{alone.wall / full.wall:.2f}** times as fast "
+        "as one worker with one core. One worker with all cores already uses most of them, because tracking, graph and "
+        f"decoder run in parallel: {many} workers are {whole.wall / full.wall:.2f} times as fast as that one. The "
+        "times include the start, the search for cuts, and the last shots, during which workers are idle.",
     ]
 
 
 def _batch_ate(folder: Path, part: Part) -> float:
-    """NaN where there is no reconstruction."""
+    """Median ATE of a shot of the film, metres; NaN if it has no reconstruction."""
     try:
         return median_ate(read_result(folder), part.shot, part.frames)
     except InputError:

@@ -37,7 +37,7 @@ _UNITS = (
 
 
 def recall_curves(records: Records, path: Path) -> None:
-    """Recall of ATE, T-RPE and R-RPE up to the larger threshold of the paper, the smaller one marked; log scale."""
+    """Recall curves of ATE, T-RPE and R-RPE up to the paper's larger threshold, with its smaller one marked."""
     figure, panels = plt.subplots(1, 3, figsize=(12, 4.2), sharey=True)
     for label, members in by_label(records).items():
         for axes, errors, (_, _, unit, limits) in zip(panels, pooled_errors(members), _UNITS, strict=True):
@@ -53,7 +53,7 @@ def recall_curves(records: Records, path: Path) -> None:
 
 
 def depth_recall(records: Records, path: Path) -> None:
-    """Recall of the relative depth error of the points up to 20 %."""
+    """Recall curve of the relative depth error of the points, up to 20 %."""
     figure, axes = plt.subplots(figsize=(8, 4.8))
     x = np.linspace(0.0, 0.2, 400)
     for label, members in by_label(records).items():
@@ -66,13 +66,13 @@ def depth_recall(records: Records, path: Path) -> None:
 
 
 def error_against_parallax(records: Records, path: Path) -> None:
-    """Median ATE against the parallax, one dot for each shot and method; on top where half the frames are missing."""
+    """Median ATE against parallax, a dot per shot and method; at the top if half of the frames are not registered."""
     figure, axes = plt.subplots(figsize=(8, 5))
     known = [r for r in records if parallax_of(r) is not None]
     medians = {id(r): 1e3 * float(np.median(r.errors.ate)) for r in known}
     highest = max((m for m in medians.values() if np.isfinite(m)), default=1.0)
     missing = 3.0 * highest
-    # Side by side around the true parallax, so that dots of equal height can be told apart.
+    # Dots of one shot are side by side around its parallax, so that equal errors do not cover each other.
     labels = by_label(known)
     for offset, (label, members) in zip(np.linspace(-0.06, 0.06, len(labels)), labels.items(), strict=True):
         x = np.array([parallax_of(r) for r in members], np.float64) * np.exp(offset)
@@ -92,7 +92,7 @@ def error_against_parallax(records: Records, path: Path) -> None:
 
 
 def parallax_histogram(records: Records, path: Path) -> None:
-    """How many shots have which parallax."""
+    """Histogram of the parallax of the shots."""
     values = {shot: value for shot, members in by_shot(records).items() if (value := _full_parallax(members))}
     figure, axes = plt.subplots(figsize=(6.4, 3.6))
     axes.hist(list(values.values()), bins=np.geomspace(2e-3, 2.0, 16).tolist(), color="#1f4e9c", edgecolor="white")
@@ -103,7 +103,7 @@ def parallax_histogram(records: Records, path: Path) -> None:
 
 
 def _full_parallax(members: Records) -> float | None:
-    """Parallax of the longest variant of a shot."""
+    """Parallax of a shot, from the record with the most frames."""
     return parallax_of(max(members, key=lambda record: len(record.arrays["indices"])))
 
 
@@ -114,7 +114,7 @@ def _line(label: Label) -> dict[str, Any]:
 
 
 def _plain_numbers(axis: Axis) -> None:
-    """0.01 instead of a power of ten, at 1, 2 and 5 of every decade."""
+    """Label 1, 2 and 5 of every decade of a logarithmic axis, as 0.01 instead of a power of ten."""
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axis.set_major_formatter("{x:g}")
     axis.set_minor_formatter(NullFormatter())

@@ -1,4 +1,8 @@
-"""The inputs of a cell: the shot, its frames as the variant has them, and the depth prior."""
+"""The inputs of a cell: the shot, its frames in the variant, and the depth prior.
+
+A data folder holds sets one level down, such as ``DATA/studiosim/d01``; `evaluation.readers.read_shot` says what a set
+holds.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +37,8 @@ from factorsfm.evaluation.readers import read_shot
 from factorsfm.evaluation.truth import DepthLookup, Shot
 from factorsfm.evaluation.useless_priors import ImageRowPrior, RandomSmoothPrior
 
-_CENTIMETRES = ("tsukuba-",)  # sets whose true translations are not in metres
+_CENTIMETRES = ("tsukuba-",)  # beginnings of the names of sets whose true translations are in centimetres
+_FAINT_NOISE = 0.5  # standard deviation in grey levels: no eye sees it
 NETWORK_FILES = {
     "tcmonodepth": "tcmonodepth_tcsmallnet_192x320.onnx",
     "fastdepth": "fast_depth_224_fp32.onnx",
@@ -42,11 +47,11 @@ NETWORK_FILES = {
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """A change of the input.
+    """A change of the input or of the tracker.
 
     Attributes:
-        frames: how many of the first frames are used, None = all.
-        max_tracks: of our tracker, None = its default.
+        frames: number of the first frames that are used; None for all.
+        max_tracks: as in `TrackerOptions`; None for its default.
     """
 
     frames: int | None = None
@@ -63,11 +68,10 @@ VARIANTS = {
     AS_SET: Variant(),
 }
 VARIANTS |= {drawn(name, draw): variant for name, variant in VARIANTS.items() for draw in DRAWS}
-_FAINT = 0.5  # grey levels
 
 
 def shot_folder(data: Path, name: str) -> Path:
-    """Folder of a set by its name, one level below the data folder.
+    """The folder of a set.
 
     Raises:
         InputError: there is none.
@@ -79,7 +83,7 @@ def shot_folder(data: Path, name: str) -> Path:
 
 
 def open_shot(data: Path, name: str, variant: str) -> Shot:
-    """The shot with its truth, cut to the frames of the variant."""
+    """The shot, with the truth of the frames of the variant."""
     shot = read_shot(shot_folder(data, name), unit=0.01 if name.startswith(_CENTIMETRES) else 1.0)
     frames = VARIANTS[variant].frames
     if frames is None:
@@ -89,7 +93,7 @@ def open_shot(data: Path, name: str, variant: str) -> Shot:
 
 
 def open_frames(shot: Shot, variant: str) -> Iterator[Frame]:
-    """The frames as the variant has them."""
+    """The frames of the variant."""
     frames = islice(shot.frames(), VARIANTS[variant].frames)
     name, draw = undrawn(variant)
     if draw:
@@ -102,7 +106,7 @@ def open_frames(shot: Shot, variant: str) -> Iterator[Frame]:
 
 
 def _with_faint_noise(frame: Frame, draw: int) -> Frame:
-    noise = np.random.default_rng([draw, frame.index]).normal(0.0, _FAINT, frame.image.shape)
+    noise = np.random.default_rng([draw, frame.index]).normal(0.0, _FAINT_NOISE, frame.image.shape)
     return replace(frame, image=np.clip(np.round(frame.image + noise), 0, 255).astype(np.uint8))
 
 
@@ -137,7 +141,7 @@ def compressed_frames(frames: Iterable[Frame], crf: int) -> Iterator[Frame]:
 
 
 class TrueDepthPrior:
-    """True or sensor depth, with multiplicative noise ``D (1 + alpha n)``, n standard normal per pixel."""
+    """True or sensor depth D with multiplicative noise, ``D (1 + alpha n)``; n is standard normal for each pixel."""
 
     def __init__(self, depth: DepthLookup, kind: DepthKind, alpha: float = 0.0) -> None:
         self.kind, self.name = kind, f"true depth, noise {alpha}"
@@ -152,7 +156,7 @@ class TrueDepthPrior:
 
 
 def open_prior(name: str, shot: Shot, data: Path, models: Path, cache: Path) -> DepthPrior | None:
-    """A prior by its name: a network, `simulated`, `sensor`, `image-row`, `random-field`, `noise-ALPHA`, `none`.
+    """The prior of this name: a network, `simulated`, `sensor`, `image-row`, `random-field`, `noise-ALPHA` or `none`.
 
     Raises:
         InputError: no such prior.
@@ -170,13 +174,13 @@ def open_prior(name: str, shot: Shot, data: Path, models: Path, cache: Path) -> 
     if name == "random-field":
         return RandomSmoothPrior()
     if name.startswith("noise-"):
-        # The unit is not given away: the paper's priors do not know it either.
+        # As depth in an unknown unit, as the paper's priors have it.
         return TrueDepthPrior(shot.depth, DepthKind.DEPTH, float(name.removeprefix("noise-")))
     raise InputError(f"unknown prior {name}")
 
 
 def simulated_prior(name: str, data: Path, cache: Path) -> Path:
-    """Folder of the simulated prior's maps of a shot, made once by the script beside the data."""
+    """The folder of the simulated prior of a shot; a script in the data folder makes it once."""
     folder = cache / "simulated" / name
     if not folder.is_dir():
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -189,7 +193,7 @@ def simulated_prior(name: str, data: Path, cache: Path) -> Path:
 
 
 def settle(made: Path, folder: Path) -> None:
-    """Give a finished folder its place, unless another process was faster."""
+    """Move a finished folder to its place, unless another process has put one there."""
     try:
         made.rename(folder)
     except OSError:

@@ -1,22 +1,18 @@
-"""Unknown lenses: focal length and poses of each shot without its camera, and shots distorted by known lenses.
-
-Also of each shot reversed, its halves and every second frame: other tracks, for which nothing was made.
+"""Unknown lenses: focal length and poses of each shot without its camera, and of shots distorted by known lenses.
 
     python -m benchmarks.lens --data FOLDER --models FOLDER
 
-FOLDER/studiosim and FOLDER/real hold the shots with their truth (`benchmarks.inputs`). Rows that were measured before
-and are not asked for stay as they are (`results/lens.json`).
+A shot can also be reversed, halved or thinned out, which gives tracks on which nothing was tuned. The data folder is
+that of `benchmarks.inputs`. Rows that are not measured now stay as they are (`results/lens.json`).
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -25,6 +21,7 @@ from numpy.typing import NDArray
 
 import factorsfm
 from benchmarks.inputs import NETWORK_FILES
+from benchmarks.rows import KeptRows, Row, rows_table
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.noise import coordinate_sigma
 from factorsfm.adjustment.observations import Observations
@@ -44,18 +41,14 @@ DISTORTIONS = {  # k1, k2, and shots
     (-0.15, 0.02): _SEVEN,
     (0.08, 0.0): _TWO,
 }
-_HELD = " focal length given"
+_HELD = " focal length given"  # end of the names of rows
 PARTS = ("reversed", "every second frame", "first half", "second half")
-_LONGER = 1.005
-_SCALES = np.linspace(0.95, 1.05, 401)
-_RESULTS = Path(__file__).parent / "results"
-RESULT, ROWS = _RESULTS / "LENS.md", _RESULTS / "lens.json"
-
-Row = dict[str, Any]
+_FOCAL_STEP = 1.005  # factor by which a focal length is increased until no pixel is empty
+_FOCAL_ERRORS = np.linspace(0.95, 1.05, 401)  # relative, that are tried to explain a difference of two lenses
 
 
 class Distorted:
-    """A shot as a lens with radial distortion would have seen it: its frames, and its masks as a mask prior."""
+    """A shot as a lens with radial distortion records it: iterate for its frames, call for its masks."""
 
     def __init__(self, shot: Shot, lens: pycolmap.Camera) -> None:
         x, y = np.meshgrid(np.arange(lens.width), np.arange(lens.height))
@@ -77,7 +70,7 @@ class Distorted:
 
 
 class Part:
-    """Some frames of a shot, as one of `PARTS` says."""
+    """Some frames of a shot: one of `PARTS`."""
 
     def __init__(self, shot: Shot, name: str) -> None:
         frames = list(shot.frames())
@@ -91,7 +84,7 @@ class Part:
 
 
 def true_lens(shot: Shot, k1: float, k2: float) -> pycolmap.Camera:
-    """The lens of the distorted shot, just long enough that it sees nothing outside the frames that there are."""
+    """A lens with distortion k1, k2 and the shortest focal length with which its image lies within that of the shot."""
     focal, size = shot.camera.mean_focal_length(), np.array([shot.camera.width, shot.camera.height])
     along, last = np.linspace(0.0, 1.0, 65), size - 1
     rim = [np.stack([along, np.full(65, end)], 1) for end in (0.0, 1.0)]
@@ -101,14 +94,14 @@ def true_lens(shot: Shot, k1: float, k2: float) -> pycolmap.Camera:
         seen = pixels_from_normalized(shot.camera, normalized_from_pixels(lens, edge))
         if (np.abs(seen - 0.5 * last) <= 0.5 * last + 0.01).all():
             return lens
-        focal *= _LONGER
+        focal *= _FOCAL_STEP
 
 
 def difference_px(lens: pycolmap.Camera, truth: pycolmap.Camera, scale: float = 1.0) -> NDArray[np.float64]:
-    """Between the pixels of the same ray in both lenses, over the image.
+    """(n,) distances between the pixels of the same ray in two lenses, for rays over the image.
 
     Args:
-        scale: of the rays' distance from the axis in the lens: what a focal length that is only wrong does to them.
+        scale: factor on the distance of the rays from the axis of `lens`, to compensate an error of the focal length.
     """
     x, y = np.meshgrid(np.linspace(0, truth.width - 1, 33), np.linspace(0, truth.height - 1, 19))
     pixels = np.stack([x.ravel(), y.ravel()], 1)
@@ -117,14 +110,14 @@ def difference_px(lens: pycolmap.Camera, truth: pycolmap.Camera, scale: float = 
 
 
 def bent_px(lens: pycolmap.Camera, truth: pycolmap.Camera) -> float:
-    """What is left of the median difference when the wrong focal length is taken out: lines that are not straight."""
-    return min(float(np.median(difference_px(lens, truth, scale))) for scale in _SCALES)
+    """Median difference of two lenses, pixels, without the error of the focal length: what bends straight lines."""
+    return min(float(np.median(difference_px(lens, truth, scale))) for scale in _FOCAL_ERRORS)
 
 
 def focal_of_true_poses(known: factorsfm.Reconstruction, shot: Shot) -> float:
-    """Focal length with which the tracks of a reconstruction fit the true poses, in pixels.
+    """Focal length, pixels, with which the tracks of a reconstruction fit the true poses.
 
-    Where it is not the true one, poses and camera of the reference do not belong together.
+    If it is not that of the true camera, poses and camera of the reference do not belong together.
     """
     frames = np.array([f.index for f in known.registered])
     found = [f.cam_from_world for f in known.registered if f.cam_from_world is not None]
@@ -167,42 +160,34 @@ def pose_auc(result: factorsfm.Reconstruction, shot: Shot) -> str:
 
 
 def main() -> None:
-    """Measure what is asked for and write the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--models", type=Path, required=True)
     parser.add_argument("--shots", nargs="*", default=[f"d{k:02d}" for k in range(1, 11)], help="beginnings of names")
-    parser.add_argument("--distorted", nargs="*", default=_SEVEN, help="the same, of those to see through other lenses")
-    parser.add_argument("--held", action="store_true", help="the latter with their focal length given")
-    parser.add_argument("--parts", nargs="*", default=[], help="the same, of those to see in parts")
+    parser.add_argument("--distorted", nargs="*", default=_SEVEN, help="shots that are also distorted by other lenses")
+    parser.add_argument("--held", action="store_true", help="distorted shots with their focal length given")
+    parser.add_argument("--parts", nargs="*", default=[], help="shots of which parts are measured, too")
     arguments = parser.parse_args()
     depth = factorsfm.DepthModel(arguments.models / NETWORK_FILES["tcmonodepth"])
     folders = sorted(arguments.data.glob("*/*"))
-    rows: dict[str, Row] = json.loads(ROWS.read_text()) if ROWS.exists() else {}
-
-    def keep(key: str, row: Row) -> None:
-        rows[key] = row
-        print(key, row, flush=True)
-        ROWS.write_text(json.dumps(rows, indent=1) + "\n")
-        RESULT.write_text(report(rows))
-
+    rows = KeptRows("lens", report)
     for folder in folders:
         if folder.name.startswith(tuple(arguments.shots)):
-            keep(folder.name, shot_row(read_shot(folder), depth))
+            rows.keep(folder.name, shot_row(read_shot(folder), depth))
         if folder.name.startswith(tuple(arguments.parts)):
             shot = read_shot(folder)
             for part in PARTS:
                 result = factorsfm.reconstruct(Part(shot, part), depth=depth, masks=shot.masks)
-                keep(f"{folder.name}, {part}", _found(result, shot.camera))
+                rows.keep(f"{folder.name}, {part}", _found(result, shot.camera))
     for (k1, k2), names in DISTORTIONS.items():
         for folder in folders:
             if folder.name.startswith(names) and folder.name.startswith(tuple(arguments.distorted)):
                 key = f"{folder.name} {k1} {k2}{_HELD * arguments.held}"
-                keep(key, distorted_row(read_shot(folder), depth, k1, k2, held=arguments.held))
+                rows.keep(key, distorted_row(read_shot(folder), depth, k1, k2, held=arguments.held))
 
 
 def shot_row(shot: Shot, depth: factorsfm.DepthModel) -> Row:
-    """The shot with its lens known, and without."""
+    """The shot with its lens known and unknown."""
     known = factorsfm.reconstruct(shot.source, camera=shot.camera, depth=depth, masks=shot.masks)
     begin = time.perf_counter()
     result = factorsfm.reconstruct(shot.source, depth=depth, masks=shot.masks)
@@ -216,7 +201,7 @@ def shot_row(shot: Shot, depth: factorsfm.DepthModel) -> Row:
 
 
 def distorted_row(shot: Shot, depth: factorsfm.DepthModel, k1: float, k2: float, *, held: bool) -> Row:
-    """The shot as a lens with this distortion would have seen it, without its lens, or with its focal length alone."""
+    """The shot as a lens with this distortion records it, with the lens unknown, or only its focal length given."""
     truth = true_lens(shot, k1, k2)
     camera = with_focal(shot.camera, truth.mean_focal_length()) if held else None
     seen = Distorted(shot, truth)
@@ -243,8 +228,7 @@ def _found(result: factorsfm.Reconstruction, truth: pycolmap.Camera) -> Row:
 
 
 def report(rows: dict[str, Row]) -> str:
-    """The tables, as Markdown."""
-    rows = dict(sorted(rows.items()))
+    """The tables as Markdown."""
     plain = {key: row for key, row in rows.items() if " " not in key}
     parts = {key: row for key, row in rows.items() if key.endswith(PARTS)}
     bent = {key: row for key, row in rows.items() if " " in key and not key.endswith((_HELD, *PARTS))}
@@ -253,29 +237,22 @@ def report(rows: dict[str, Row]) -> str:
         [
             "# Unknown lenses", "",
             "`python -m benchmarks.lens --data FOLDER --models FOLDER`, and the real sets with `--shots NAME ...`", "",
-            "Prior: TCMonoDepth; masks where the shot has them. AUC: relative poses at 1 / 5 degrees. std: of the "
-            "focal length. Not determined: not certain enough to count as an estimate; without a std the first guess "
-            "is kept. f of true poses: with which the tracks fit the true poses; where it is another one, poses and "
-            "camera of the reference do not belong together.", "",
+            "Prior: TCMonoDepth; masks where the shot has them. AUC: relative poses at 1 / 5 degrees. std: standard "
+            "deviation of the focal length. Not determined: too uncertain to count as an estimate; without a std the "
+            "first guess is kept. f of true poses: the focal length with which the tracks fit the true poses; if it is "
+            "another one, poses and camera of the reference do not belong together.", "",
             *rows_table("shot", plain),
             "Parts of the same shots (`--parts NAME ...`):", "",
             *rows_table("shot, part", parts),
-            "The same seen through lenses with distortion k1, k2, and unknown; the focal length is a little longer, so "
-            "that the image is full. px: between the pixels of the same ray in the true and in the found lens, over "
-            "the image; at its own focal length: the median of what is left when the error of the focal length is "
-            "taken out.", "",
+            "The same through unknown lenses with distortion k1, k2; their focal length is a little longer, so that "
+            "the image is full. px: distance between the pixels of the same ray in the true and in the estimated lens, "
+            "over the image; at its own focal length: the median of these distances without the error of the focal "
+            "length.", "",
             *rows_table("shot, k1, k2", bent),
             "The same with the focal length given (`--lens radial`):", "",
             *rows_table("shot, k1, k2", held),
         ]
     )  # fmt: skip
-
-
-def rows_table(first: str, rows: dict[str, Row]) -> list[str]:
-    """The rows as a table; `first`: heading of the column with their names."""
-    columns = list(next(iter(rows.values()), {}))
-    lines = [f"| {key} | {' | '.join(row[c] for c in columns)} |" for key, row in rows.items()]
-    return [f"| {first} | {' | '.join(columns)} |", "|---" * (len(columns) + 1) + "|", *lines, ""]
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""How the stream keeps up, and how good its poses are at once: ``python -m benchmarks.live --data FOLDER``."""
+"""Speed of the stream and accuracy of its causal poses: ``python -m benchmarks.live --data FOLDER``."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ Array = NDArray[np.float64]
 
 _COLUMNS = (("ATE", 0.002), ("ATE", 0.02), ("T-RPE", 0.001), ("T-RPE", 0.005), ("R-RPE", 0.02), ("R-RPE", 0.1))
 _HEADER = ["ATE 0.2 cm", "ATE 2 cm", "T-RPE 0.1 cm", "T-RPE 0.5 cm", "R-RPE 0.02°", "R-RPE 0.1°"]
-_WARM_UP = 500  # frames of the long stream after which memory is measured
-SIGMAS = 5.0
+_WARM_UP_FRAMES = 500  # of the long stream, after which memory is measured
+SIGMAS = 5.0  # standard deviations within which a pose must be
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,10 +40,11 @@ class Measured:
     """A stream over one shot.
 
     Attributes:
-        latency: (n,) seconds of each push. seconds: of the whole, decoding included.
-        errors: per trajectory (ATE, T-RPE, R-RPE) of all frames.
-        inside: (n - 1,) whether the truth lies in the 5-sigma region of the causal pose.
-        extent: of the true path, metres.
+        latency: (n,) seconds of each push.
+        seconds: wall time of the whole stream, with decoding.
+        errors: ATE, T-RPE and R-RPE of all frames, for each kind of poses.
+        inside: (n - 1,) whether the truth is in the 5-sigma region of the causal pose.
+        extent: largest distance of a true camera from the first one, metres.
     """
 
     name: str
@@ -89,16 +90,16 @@ def _inside(updates: Sequence[FrameUpdate], shot: Shot) -> NDArray[np.bool_]:
 def sigmas(
     poses: Sequence[pycolmap.Rigid3d | None], covariances: Sequence[Array | None], rotations: Array, centers: Array
 ) -> Array:
-    """How far poses are from the truth, in standard deviations: the larger one of rotation and translation.
+    """Errors of poses in standard deviations (Mahalanobis distance): the larger of rotation and translation.
 
-    They are taken relative to the first one, with the one scale that is free.
+    Poses are compared relative to the first one, after alignment of their scale.
 
     Args:
-        poses, covariances: n of them, None where there is none; the first one is there.
-        rotations, centers: (n, 3, 3) and (n, 3), the truth.
+        poses, covariances: n each, None if there is none; the first pose must be there.
+        rotations, centers: (n, 3, 3) world_from_cam and (n, 3), the truth.
 
     Returns:
-        (n,), NaN where there is no pose; 0 for the first one.
+        (n,), NaN without a pose or covariance; 0 for the first one.
     """
     found_rotations, found_centers = _relative(*pose_arrays(poses))
     rotations, centers = _relative(rotations, centers)
@@ -119,10 +120,12 @@ def sigmas(
 
 
 def _relative(rotations: Array, centers: Array) -> tuple[Array, Array]:
+    """Rotations and centres in the frame of the first camera."""
     return np.einsum("ji,njk->nik", rotations[0], rotations), (centers - centers[0]) @ rotations[0]
 
 
 def speed_table(runs: Sequence[Measured]) -> str:
+    """Frames per second and quantiles of the latency, by shot."""
     rows: list[list[object]] = []
     for run in runs:
         quantiles = [f"{1e3 * np.quantile(run.latency, q):.0f}" for q in (0.5, 0.95, 0.99)]
@@ -135,6 +138,7 @@ def speed_table(runs: Sequence[Measured]) -> str:
 
 
 def accuracy_table(runs: Sequence[Measured]) -> str:
+    """The paper's AUC columns, by kind of poses, pooled over all frames."""
     rows: list[list[object]] = []
     for name in runs[0].errors:
         pooled = dict(
@@ -149,6 +153,7 @@ def accuracy_table(runs: Sequence[Measured]) -> str:
 
 
 def shot_table(runs: Sequence[Measured]) -> str:
+    """Median ATE by kind of poses, and how often the truth is in the 5-sigma region, by shot."""
     rows: list[list[object]] = []
     for run in runs:
         ate = {name: float(np.median(errors[0])) for name, errors in run.errors.items()}
@@ -166,7 +171,7 @@ def shot_table(runs: Sequence[Measured]) -> str:
 
 
 def long_stream(count: int) -> str:
-    """A rendered move back and forth, again and again: cost per frame, memory, and drift."""
+    """Table of a rendered camera that moves back and forth for `count` frames: cost per frame, memory and drift."""
     shot = render_shot("truck", 60, 960, 540)
     latency: list[float] = []
     memory: dict[int, float] = {}
@@ -176,9 +181,9 @@ def long_stream(count: int) -> str:
             start = time.perf_counter()
             updates.append(stream.push(frame))
             latency.append(time.perf_counter() - start)
-            if k in (_WARM_UP, count - 1):
+            if k in (_WARM_UP_FRAMES, count - 1):
                 memory[k] = resident_mb()
-    early, late = np.mean(latency[200:700]), np.mean(latency[-500:])
+    early, late = np.mean(latency[200:700]), np.mean(latency[-500:])  # seconds
     order = [k for k, _ in zip(_turns(len(shot.images)), range(count), strict=False)]
     truth = [shot.cam_from_world[k] for k in order]
     errors = trajectory_errors(*pose_arrays([update.cam_from_world for update in updates]), *pose_arrays(truth))
@@ -190,7 +195,7 @@ def long_stream(count: int) -> str:
         ["ms per frame, frames 200 to 700", f"{1e3 * early:.1f}"],
         ["ms per frame, the last 500", f"{1e3 * late:.1f}"],
         ["ratio", f"{late / early:.2f}"],
-        [f"resident memory after frame {_WARM_UP}, MB", f"{memory[_WARM_UP]:.0f}"],
+        [f"resident memory after frame {_WARM_UP_FRAMES}, MB", f"{memory[_WARM_UP_FRAMES]:.0f}"],
         ["resident memory at the end, MB", f"{memory[count - 1]:.0f}"],
         ["median ATE of frames 200 to 700, % of the path", f"{100 * halves[0] / path:.3f}"],
         ["median ATE of the last 500 frames, % of the path", f"{100 * halves[1] / path:.3f}"],
@@ -230,8 +235,8 @@ def main() -> None:
         "## Speed",
         speed_table(runs),
         "## Accuracy",
-        "Area under the recall curve in percent, pooled over all frames: poses as they were given at the time, as the "
-        "graph knows them at the last frame, and after the polish.",
+        "Area under the recall curve in percent, pooled over all frames: of the poses as given at each frame, of those "
+        "of the graph at the last frame, and of the polished ones.",
         accuracy_table(runs),
         shot_table(runs),
     ]

@@ -9,7 +9,11 @@ import numpy as np
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[Any]], best: Callable[..., float] | None = None) -> str:
-    """A Markdown table; the best of each column of floats is bold where `best` (max or min) is given."""
+    """A Markdown table.
+
+    Args:
+        best: max or min, whose result is bold in each column of floats; None for no bold cells.
+    """
     rows = [list(row) for row in rows]
     marks: dict[int, str] = {}
     if best is not None and len(rows) > 1:

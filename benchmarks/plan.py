@@ -1,4 +1,4 @@
-"""What is measured: experiments as named lists of cells (shot, variant, method, prior)."""
+"""What is measured: experiments, which are lists of cells (shot, variant, method, prior)."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ NOISE = ("noise-0", "noise-0.1", "noise-0.2", "noise-0.4")
 
 FULL, FIRST_10, FIRST_20, FEW, DEGRADED, CRF_30 = "full", "first-10", "first-20", "tracks-40", "degraded", "crf-30"
 AS_SET = "as-set"  # the frames as an unordered set
-DRAWS = (1, 2, 3)  # of faint noise, to tell what is luck
+DRAWS = (1, 2, 3)  # seeds of faint noise, which show how much of a difference is chance
 
 
 def drawn(variant: str, draw: int) -> str:
-    """The variant with noise that no eye sees over its frames: other tracks survive."""
+    """The variant with faint noise on its frames, with which other tracks survive."""
     return f"{variant}~{draw}"
 
 
 def undrawn(variant: str) -> tuple[str, int]:
-    """The variant without the noise, and the number of the draw, 0 for none."""
+    """The variant without faint noise, and the seed of the noise, 0 without."""
     name, _, draw = variant.partition("~")
     return name, int(draw or 0)
 
@@ -50,10 +50,10 @@ class Cell:
     """One measurement.
 
     Attributes:
-        shot: name of a data set's folder.
-        variant: what is done to the footage or the tracker, see `inputs.VARIANTS`.
+        shot: name of a set.
+        variant: change of the footage or the tracker, see `inputs.VARIANTS`.
         method: a preset of factorsfm or a baseline.
-        prior: see `inputs.open_prior`; "none" for methods without one.
+        prior: see `inputs.open_prior`; "none" for methods without a prior.
     """
 
     shot: str
@@ -71,7 +71,7 @@ def _cells(
     priors: Iterable[str] = (NO_PRIOR,),
     variants: Iterable[str] = (FULL,),
 ) -> list[Cell]:
-    """All combinations; methods that read no prior appear once."""
+    """All combinations; a method without a prior occurs once."""
     cells = [
         Cell(shot, variant, method, NO_PRIOR if method == "geometry" or method in COLMAP else prior)
         for shot in shots
@@ -113,11 +113,11 @@ QUICK = {
     "edge": _cells(EDGE[:1], ("default",), ("tcmonodepth",)),
 }
 
-OTHERS = "others"  # experiment with the sets of the data that no other one names
+OTHERS = "others"  # the experiment with the sets in the data folder that no other experiment names
 
 
 def planned(sets: Collection[str], quick: bool) -> dict[str, list[Cell]]:
-    """Experiments on the sets (names) that there are."""
+    """The experiments on the sets of these names."""
     named = {cell.shot for cells in EXPERIMENTS.values() for cell in cells}
     others = _cells(sorted(set(sets) - named), (*_THREE, *COLMAP), ("tcmonodepth",))
     plan = QUICK if quick else {**EXPERIMENTS, OTHERS: others}

@@ -1,17 +1,15 @@
-"""Rolling shutter: shots read row by row with a known readout, and real clips; what is found, and what it is worth.
+"""Rolling shutter: the estimated readouts of shots with a known one and of real clips, and their effect on the poses.
 
     python -m benchmarks.rolling --data FOLDER --models FOLDER
 
-FOLDER/studiosim and FOLDER/real hold the shots with their truth (`benchmarks.inputs`). The studio shots are read anew
-by a rolling shutter (`factorsfm.synthetic.read_by_rows`), with their true depth and poses; the real clips are as they
-are.
-Rows that were measured before and are not asked for stay as they are (`results/rolling.json`).
+The data folder is that of `benchmarks.inputs`. The studio shots are read row by row with their true depth and poses
+(`factorsfm.synthetic.read_by_rows`); the real clips are used as they are. Rows that are not measured now stay as they
+are (`results/rolling.json`).
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +22,8 @@ from numpy.typing import NDArray
 
 import factorsfm
 from benchmarks.inputs import NETWORK_FILES
-from benchmarks.lens import Row, pose_auc, rows_table
+from benchmarks.lens import pose_auc
+from benchmarks.rows import KeptRows, Row, rows_table
 from factorsfm.evaluation.metrics import trajectory_errors
 from factorsfm.evaluation.readers import read_shot
 from factorsfm.evaluation.truth import Shot
@@ -35,12 +34,10 @@ from factorsfm.synthetic import read_by_rows
 READOUTS = {"d03": 0.9, "d05": 0.4, "d07": 0.6, "d10": 0.9}
 REAL = ("desk", "hololens", "kitchen", "tsukuba")
 USES = get_args(ShutterUse)
-_RESULTS = Path(__file__).parent / "results"
-RESULT, ROWS = _RESULTS / "ROLLING.md", _RESULTS / "rolling.json"
 
 
 class Rolled:
-    """The frames of a shot as a rolling shutter would have read them."""
+    """The frames of a shot as a rolling shutter reads them."""
 
     def __init__(self, shot: Shot, readout: float) -> None:
         frames = list(shot.frames())
@@ -49,7 +46,7 @@ class Rolled:
         self._frames = []
         for k, frame in enumerate(frames):
             known = shot.depth(frame.index)
-            known = shot.depth(frame.index - 1) if known is None else known  # every second one has depth
+            known = shot.depth(frame.index - 1) if known is None else known  # every second frame has depth
             assert known is not None
             image = read_by_rows(frame.image, _filled(known), shot.camera, path, k, readout)
             self._frames.append(replace(frame, image=image))
@@ -59,13 +56,17 @@ class Rolled:
 
 
 def _filled(depth: NDArray[np.float32]) -> NDArray[np.float32]:
-    """With what is unknown as far as the farthest is."""
+    """The depth map with its largest depth where it is unknown."""
     far = float(np.nanmax(np.where(np.isfinite(depth), depth, 0.0)))
     return np.where(np.isfinite(depth), depth, np.float32(far)).astype(np.float32)
 
 
 def shot_row(shot: Shot, depth: factorsfm.DepthModel, readout: float | None) -> Row:
-    """A shot, read by rows unless it was recorded so, with each use of its shutter, its lens known and unknown."""
+    """A shot with each `ShutterUse`, its lens known and unknown.
+
+    Args:
+        readout: with which the shot is read row by row; None for a clip that is used as it is.
+    """
     source = shot.source if readout is None else Rolled(shot, readout)
     row: Row = {"readout": "" if readout is None else f"{readout:.2f}"}
 
@@ -106,7 +107,7 @@ def _ate(result: factorsfm.Reconstruction, shot: Shot) -> float:
 
 
 def _depth_spread(result: factorsfm.Reconstruction, shot: Shot) -> str:
-    """Robust deviation of the points' depths from the sensor's, relative, but for one scale."""
+    """Robust standard deviation of the ratio between the depths of the points and those of the sensor, percent."""
     ratios = []
     for position, frame in enumerate(result.frames):
         depth = shot.depth(frame.index)
@@ -125,7 +126,6 @@ def _depth_spread(result: factorsfm.Reconstruction, shot: Shot) -> str:
 
 
 def main() -> None:
-    """Measure what is asked for and write the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--models", type=Path, required=True)
@@ -133,36 +133,31 @@ def main() -> None:
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     depth = factorsfm.DepthModel(arguments.models / NETWORK_FILES["tcmonodepth"])
-    rows: dict[str, Row] = json.loads(ROWS.read_text()) if ROWS.exists() else {}
+    rows = KeptRows("rolling", report)
     for folder in sorted(arguments.data.glob("*/*")):
         if folder.name.startswith(tuple(arguments.shots)):
             readout = next((r for name, r in READOUTS.items() if folder.name.startswith(name)), None)
-            rows[folder.name] = shot_row(read_shot(folder), depth, readout)
-            print(folder.name, rows[folder.name], flush=True)
-            ROWS.write_text(json.dumps(rows, indent=1) + "\n")
-            RESULT.write_text(report(rows))
+            rows.keep(folder.name, shot_row(read_shot(folder), depth, readout))
 
 
 def report(rows: dict[str, Row]) -> str:
-    """The tables, as Markdown."""
-    rows = dict(sorted(rows.items()))
-    made = {name: row for name, row in rows.items() if row["readout"]}
+    """The tables as Markdown."""
+    simulated = {name: row for name, row in rows.items() if row["readout"]}
     real = {name: {k: v for k, v in row.items() if k != "readout"} for name, row in rows.items() if not row["readout"]}
     return "\n".join(
         [
             "# Rolling shutter", "",
             "`python -m benchmarks.rolling --data FOLDER --models FOLDER`", "",
-            "Each shot with `shutter` global (it is not looked for), auto (poses fit the recorded images) and rolling "
-            "(poses of the moment at which the middle of the image is read). Readout: share of the time between two "
-            "frames from the first row to the last. ATE: root mean square after alignment; AUC: relative poses at 1 / "
-            "5 degrees; px: median reprojection error; depth spread: robust deviation of the points' depths from a "
-            "depth sensor's, but for one scale. Then the same without a camera: error of the focal length, and "
-            "its standard deviation.", "",
-            "Studio shots, read anew row by row with a known readout; the truth is of the middle of the image:", "",
-            *rows_table("shot", made),
-            "Real clips. The reference of the kitchens stems from a reconstruction that knows of no rolling shutter, "
-            "and errs as the recorded images do; that of the HoloLens is its head tracking. tsukuba is rendered, "
-            "without.", "",
+            "Each shot with `shutter` global (a global shutter is assumed), auto (poses of a global shutter that fit "
+            "the recorded images) and rolling (poses at the time when the middle of the image is read). Readout: time "
+            "from the first row to the last, in frames. ATE: root mean square after alignment; AUC: relative poses at "
+            "1 / 5 degrees; px: median reprojection error; depth spread: robust standard deviation of the ratio "
+            "between the depths of the points and those of a depth sensor. Then the same without a camera: error of "
+            "the focal length and its standard deviation.", "",
+            "Studio shots, read row by row with a known readout; the truth is that of the middle of the image:", "",
+            *rows_table("shot", simulated),
+            "Real clips. The reference of the kitchens is a reconstruction that assumes a global shutter and has its "
+            "errors; that of the HoloLens is its head tracking. tsukuba is rendered with a global shutter.", "",
             *rows_table("shot", real),
         ]
     )  # fmt: skip

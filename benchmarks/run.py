@@ -1,7 +1,7 @@
-"""Measure all methods on all shots, and draw the tables: ``python -m benchmarks.run --data FOLDER``.
+"""Measures all methods on all shots, and draws the tables: ``python -m benchmarks.run --data FOLDER``.
 
-Every cell runs in a process of its own with a time limit and is kept in the cache, so that an interrupted run goes on
-where it stopped.
+Every cell runs in a process of its own with a time limit. Its record is kept in the cache, so that an interrupted run
+goes on where it stopped.
 """
 
 from __future__ import annotations
@@ -63,13 +63,13 @@ def main() -> None:
 
 
 def measure_all(cells: Iterable[Cell], folders: Folders, timeout: float, retry: bool = False) -> None:
-    """Measure the cells that the cache does not hold, with a line of progress for each.
+    """Measure the cells that the cache does not hold, and print a line for each.
 
     Args:
         timeout: seconds for a cell.
         retry: whether cells that failed before are measured again.
     """
-    # Shot by shot, so that the mappers of COLMAP find the matches that the first of them made.
+    # Shot by shot, because the mappers of COLMAP share the matches of a shot.
     ordered = sorted(dict.fromkeys(cells), key=lambda cell: (cell.shot, cell.variant))
     missing = [cell for cell in ordered if not _is_measured(record_path(cell, folders.data, folders.cache), retry)]
     _say(f"{len(ordered)} cells, {len(ordered) - len(missing)} of them in the cache.")
@@ -90,7 +90,7 @@ def measure_all(cells: Iterable[Cell], folders: Folders, timeout: float, retry: 
 
 
 def measure_cell(cell: Cell, folders: Folders, timeout: float) -> str:
-    """Measure one cell in a process of its own, keep its record, and say in a few words what came out."""
+    """Measure one cell in a process of its own and keep its record; returns the outcome in a few words."""
     path = record_path(cell, folders.data, folders.cache)
     job = {"cell": asdict(cell), "record": str(path), **{k: str(v) for k, v in asdict(folders).items()}}
     process = subprocess.Popen(
@@ -125,11 +125,11 @@ def measure_cell(cell: Cell, folders: Folders, timeout: float) -> str:
 
 
 def write_manifest(chosen: dict[str, list[Cell]], folders: Folders, output: Path) -> None:
-    """Which records make which experiment, beside the results; experiments that did not run now are kept."""
+    """Write beside the results which records belong to which experiment; experiments that did not run now stay."""
     output.mkdir(parents=True, exist_ok=True)
     path = output / MANIFEST
     known = json.loads(path.read_text()) if path.is_file() else {}
-    # The cache of another machine is not here: without its records, an experiment cannot be drawn beside the new ones.
+    # An experiment that ran on another machine has no records in this cache, so it cannot be drawn.
     manifest = {
         name: facts
         for name, facts in known.items()
@@ -153,6 +153,7 @@ def write_manifest(chosen: dict[str, list[Cell]], folders: Folders, output: Path
 
 
 def machine() -> str:
+    """Processor, cores and memory of this machine."""
     cpu = platform.processor() or platform.machine()
     if (info := Path("/proc/cpuinfo")).is_file():
         models = [line.split(":")[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")]
@@ -162,7 +163,7 @@ def machine() -> str:
 
 
 def _commit() -> str:
-    """The commit, with a + where files of the package are changed."""
+    """The commit, followed by + if files of the package have changed since."""
 
     def git(*words: str) -> str:
         return subprocess.run(["git", *words], cwd=HERE, capture_output=True, text=True).stdout.strip()

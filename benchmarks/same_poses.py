@@ -3,8 +3,8 @@
     python -m benchmarks.same_poses record BEFORE --data DATA --models MODELS     # with the code before the change
     python -m benchmarks.same_poses compare BEFORE --data DATA --models MODELS    # with the code after it
 
-Each job is solved in a process of its own. Compared are the poses as they were given, the polished poses, the points
-and the focal length: equal to the last bit, or else the largest displacement of a camera as a share of the path.
+Each job is solved in a process of its own. Causal poses, polished poses, covariances, points and the focal length are
+compared bit by bit; if they differ, the largest displacement of a camera is given as a share of the path.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from benchmarks.inputs import NETWORK_FILES, shot_folder
 Array = NDArray[np.float64]
 Arrays = dict[str, Array]
 
-ALLOWED = 1e-6  # of the path, where a change reorders arithmetic
+ALLOWED = 1e-6  # largest displacement as a share of the path, for changes that reorder arithmetic
 _WORKERS = 2
 
 
@@ -39,8 +39,8 @@ class Job:
     Attributes:
         shot: name of the set.
         camera, masks: whether those of the set are given.
-        options: further arguments of `factorsfm.reconstruct`; live: whether the frames are pushed one by one, so that
-            the poses as given are compared, too.
+        live: whether the frames are pushed one by one, so that the causal poses are compared, too.
+        options: further arguments of `factorsfm.reconstruct`.
     """
 
     shot: str
@@ -104,7 +104,7 @@ def _stacked(covariances: Sequence[Array | None]) -> Array:
 
 
 def difference(before: Arrays, after: Arrays) -> tuple[float, list[str]]:
-    """The largest displacement of a camera as a share of the path, and the names of what is not the same to the bit."""
+    """The largest displacement of a camera as a share of the path, and the names of the arrays that differ."""
     changed = [name for name, old in before.items() if not np.array_equal(old, after[name], equal_nan=True)]
     worst = 0.0
     for name in ("poses", "poses as given"):
@@ -123,7 +123,7 @@ def _centers(poses: Array) -> Array:
 
 
 def _run_all(names: Sequence[str], folder: Path, arguments: Sequence[str]) -> None:
-    """Solve jobs in processes of their own, two at a time; each leaves its arrays in the folder."""
+    """Solve jobs in processes of their own, two at a time; each writes its arrays to the folder."""
 
     def run(name: str) -> None:
         command = [sys.executable, "-m", "benchmarks.same_poses", "solve", str(folder), "--jobs", name, *arguments]
@@ -134,7 +134,7 @@ def _run_all(names: Sequence[str], folder: Path, arguments: Sequence[str]) -> No
 
 
 def _compare(names: Sequence[str], before: Path, arguments: Sequence[str]) -> bool:
-    """Solve anew and print how far each job is from its record; whether all are within what is allowed."""
+    """Solve the jobs again and print how far each is from its record; returns whether all are within `ALLOWED`."""
     good = True
     with tempfile.TemporaryDirectory() as folder:
         _run_all(names, Path(folder), [*arguments, "--matches", str(before / "matches")])

@@ -1,4 +1,4 @@
-"""Groups of records, and the numbers of a group."""
+"""Records in groups, and the scores of a group."""
 
 from __future__ import annotations
 
@@ -23,11 +23,12 @@ from factorsfm.evaluation.metrics import (
 Array = NDArray[np.float64]
 Records = Sequence[Record]
 
-_SHARE = 0.3  # of the shots that count as those with the largest, or the smallest, parallax
+_PARALLAX_SHARE = 0.3  # of the shots, that count as those with the largest or the smallest parallax
+_WITHIN = 0.05  # largest relative error of a depth that counts as right
 
 
 class Label(NamedTuple):
-    """What a row of a table, or a line of a figure, stands for."""
+    """Method and prior of a row of a table or a line of a figure."""
 
     method: str
     prior: str
@@ -37,7 +38,7 @@ class Label(NamedTuple):
 
 
 def by_label(records: Records) -> dict[Label, list[Record]]:
-    """Records by method and prior, in the order of their first appearance."""
+    """Records by method and prior, in the order of their first occurrence."""
     groups: dict[Label, list[Record]] = {}
     for record in records:
         groups.setdefault(Label(record.cell.method, record.cell.prior), []).append(record)
@@ -45,7 +46,7 @@ def by_label(records: Records) -> dict[Label, list[Record]]:
 
 
 def by_shot(records: Records) -> dict[str, list[Record]]:
-    """Records by shot, in the order of their names."""
+    """Records by shot, in the order of the shots' names."""
     groups: dict[str, list[Record]] = {}
     for record in sorted(records, key=lambda record: record.cell.shot):
         groups.setdefault(record.cell.shot, []).append(record)
@@ -53,25 +54,25 @@ def by_shot(records: Records) -> dict[str, list[Record]]:
 
 
 def parallax_of(record: Record) -> float | None:
-    """True parallax of the frames of the shot, None where it has no depth."""
+    """True parallax of the frames of a record; None if the shot has no true depth."""
     value: float | None = record.facts["parallax"]
     return value
 
 
 def smallest_parallax(records: Records) -> list[Record]:
-    """The records of the 30 % of shots with the smallest parallax, at least one."""
+    """The records of the 30 % of the shots with the smallest parallax, but of at least one shot."""
     return _ranked(records, largest=False)
 
 
 def largest_parallax(records: Records) -> list[Record]:
-    """The records of the 30 % of shots with the largest parallax, at least one."""
+    """The records of the 30 % of the shots with the largest parallax, but of at least one shot."""
     return _ranked(records, largest=True)
 
 
 def _ranked(records: Records, largest: bool) -> list[Record]:
     values = {record.cell.shot: value for record in records if (value := parallax_of(record)) is not None}
     ranked = sorted(values, key=lambda shot: values[shot], reverse=largest)
-    chosen = ranked[: max(1, round(_SHARE * len(ranked)))]
+    chosen = ranked[: max(1, round(_PARALLAX_SHARE * len(ranked)))]
     return [record for record in records if record.cell.shot in chosen]
 
 
@@ -89,12 +90,12 @@ def _pooled(errors: Sequence[TrajectoryErrors]) -> tuple[Array, Array, Array]:
 
 
 def pose_aucs(records: Records) -> list[float]:
-    """The six columns of the paper's table, pooled over all frames."""
+    """The six AUC columns of the paper's table, pooled over all frames."""
     return _aucs(*pooled_errors(records))
 
 
 def given_aucs(records: Records) -> list[float] | None:
-    """The same for the poses as they were given frame by frame; None where a record has none."""
+    """The same for the causal poses; None if a record has none."""
     errors = [found for record in records if (found := record.given_errors) is not None]
     return _aucs(*_pooled(errors)) if len(errors) == len(records) else None
 
@@ -110,13 +111,13 @@ def pooled_depth(records: Records) -> dict[str, float]:
 
 
 def within_at_own_scale(records: Records) -> float:
-    """Percent of the points within 5 % of the true depth after each record's depths are scaled to a median ratio of 1.
+    """Percent of the points within 5 % of the true depth, with the depths of each record scaled to a median ratio of 1.
 
-    Says how good the shape is where the path is so short that the alignment hardly determines the scale.
+    It shows how good the shape is if the path is too short to determine the scale by alignment.
     """
     ratios = [errors.estimate / errors.truth for errors in (record.depth_errors for record in records)]
     scaled = np.concatenate([ratio / np.median(ratio) for ratio in ratios if len(ratio)] or [np.empty(0)])
-    return float(100.0 * (np.abs(scaled - 1.0) < 0.05).mean()) if len(scaled) else float("nan")
+    return float(100.0 * (np.abs(scaled - 1.0) < _WITHIN).mean()) if len(scaled) else float("nan")
 
 
 def relative_pose_aucs(record: Record) -> list[float]:

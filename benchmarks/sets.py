@@ -1,9 +1,9 @@
-"""Image sets: photographs and shuffled videos with truth beside COLMAP, learned features, and a large rendered set.
+"""Image sets: photographs and shuffled videos beside COLMAP, learned features, and a large rendered set.
 
     python -m benchmarks.sets --data FOLDER --models FOLDER [--images 200] [--work FOLDER]
 
-The sets with their truth are those of `benchmarks.inputs`. Every measurement runs in a process of its own
-and is kept in sets.json beside the table, so that an interrupted run goes on where it stopped.
+The data folder is that of `benchmarks.inputs`. Every measurement runs in a process of its own and is kept in sets.json
+beside the table, so that an interrupted run goes on where it stopped.
 """
 
 from __future__ import annotations
@@ -40,20 +40,24 @@ from factorsfm.support.similarity import pose_arrays
 from factorsfm.synthetic import render_views, room_camera
 
 RESULTS = Path(__file__).parent / "results"
-VIDEOS = (STUDIO[0], STUDIO[3], *WIDE_VIDEO)  # beside the kitchen
-EVERY = 3  # frame of videos
+VIDEOS = (STUDIO[0], STUDIO[3], *WIDE_VIDEO)  # besides the kitchen clips
+FRAME_STEP = 3  # of videos
 COLMAP = MappingProxyType({"COLMAP": colmap_default, "COLMAP tuned": colmap_tuned, "COLMAP global": colmap_global})
 WIDTH, HEIGHT = 1600, 1066
-ENOUGH = 40  # images to see how the cost of one grows
+ENOUGH_IMAGES = 40  # to measure how the cost of an image grows
+_RENDERED_EXTENT = 2.0  # of the path through the rendered room, units
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One measurement: a set, what reconstructs it, and whether the lens is given.
+    """One measurement.
 
-    Ours are "sift" and "xfeat" without, "sift+prior" with a depth prior; the others are in `COLMAP`.
+    Attributes:
+        name: of the set.
+        method: "sift" or "xfeat" without a depth prior, "sift+prior" with one, or a key of `COLMAP`.
+        known: whether the lens is given.
     """
 
     name: str
@@ -62,12 +66,12 @@ class Case:
 
     @property
     def key(self) -> str:
-        """In the file of results."""
+        """Its key in the file of results."""
         return f"{self.name} {self.method} {'known' if self.known else 'unknown'}"
 
 
 def rendered_path(count: int) -> list[pycolmap.Rigid3d]:
-    """Cameras on a round through the room that look to both sides on their way, (count,) cam_from_world."""
+    """cam_from_world of cameras on a closed path through the room, which pan to both sides on the way."""
     poses = []
     for t in 2 * np.pi * np.arange(count) / count:
         center = np.array([0.8 * np.sin(t), 0.35 * np.sin(5 * t), 0.5 + np.cos(t)])
@@ -77,10 +81,11 @@ def rendered_path(count: int) -> list[pycolmap.Rigid3d]:
 
 
 def measure(case: Case, data: Path, models: Path, work: Path) -> dict[str, dict[str, Any]]:
-    """Run a case in this process: errors, seconds by stage, CPU seconds, peak memory, cost by number of images.
+    """Run a case in this process.
 
     Returns:
-        The result by method: all mappers of COLMAP use the matches of one run.
+        Errors, seconds by stage, CPU seconds, peak memory and cost by number of images, by method: a case of COLMAP
+        runs all its mappers, which share the matches.
     """
     with tempfile.TemporaryDirectory() as temporary:
         if case.name.startswith("rendered"):
@@ -93,7 +98,9 @@ def measure(case: Case, data: Path, models: Path, work: Path) -> dict[str, dict[
             shot = read_shot(shot_folder(data, case.name))
             frames = list(shot.frames())
             if case.name not in UNORDERED:
-                frames = [frames[k] for k in np.random.default_rng(0).permutation(np.arange(0, len(frames), EVERY))]
+                frames = [
+                    frames[k] for k in np.random.default_rng(0).permutation(np.arange(0, len(frames), FRAME_STEP))
+                ]
             turns, centers = shot.truth(np.array([frame.index for frame in frames]))
             if case.method in COLMAP:
                 methods = [c.method for c in real_cases() if replace(c, method=case.method) == case]
@@ -116,7 +123,7 @@ def measure(case: Case, data: Path, models: Path, work: Path) -> dict[str, dict[
 
 
 def _judged(outcome: dict[str, Any], turns: Array, centers: Array) -> dict[str, Any]:
-    """The outcome with its errors instead of its poses."""
+    """The outcome, with the errors of its poses in place of the poses."""
     estimate = np.array(outcome.pop("turns")), np.array(outcome.pop("centers"))
     errors = trajectory_errors(*estimate, turns, centers)
     return outcome | {
@@ -129,7 +136,7 @@ def _judged(outcome: dict[str, Any], turns: Array, centers: Array) -> dict[str, 
 
 
 def render(folder: Path, poses: list[pycolmap.Rigid3d]) -> None:
-    """Write the images that are not there yet."""
+    """Render the images that are not in the folder yet."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / f"{k:04d}.png" for k in range(len(poses))]
     missing = [k for k, path in enumerate(paths) if not path.exists()]
@@ -168,7 +175,7 @@ def _ours(
 
 
 def _colmap(methods: list[str], shot: Shot, frames: list[factorsfm.Frame], folder: Path) -> dict[str, dict[str, Any]]:
-    """Its mappers with a known lens, which is held fixed."""
+    """Mappers of COLMAP with the known lens held fixed."""
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)
     used = time.process_time()
     matches = match_frames(shot, frames, folder)
@@ -190,7 +197,7 @@ def _colmap(methods: list[str], shot: Shot, frames: list[factorsfm.Frame], folde
 def _colmap_unknown(
     methods: list[str], shot: Shot, frames: list[factorsfm.Frame], folder: Path
 ) -> dict[str, dict[str, Any]]:
-    """Its mappers with a lens as COLMAP takes it, with default options, its guess and distortion."""
+    """Mappers of COLMAP with default options and an unknown lens, for which it guesses focal length and distortion."""
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)
     (folder / "images").mkdir()
     names = [f"{frame.index:06d}.png" for frame in frames]
@@ -224,11 +231,11 @@ def _colmap_unknown(
 
 
 def growth(trace: list[list[float]]) -> tuple[Array, Array, float]:
-    """Registered images, CPU seconds of the mapper so far, and the exponent of the cost of an image.
+    """Registered images, CPU seconds of the mapper so far, and the exponent p with which the cost of an image grows.
 
-    The total grows with the power p + 1 of the number of images where the cost of one grows with p.
+    If the cost of one image grows with the power p of their number, the total grows with the power p + 1.
     """
-    first = max(k for k, (count, _) in enumerate(trace) if count <= 1)  # of the start that was kept
+    first = max(k for k, (count, _) in enumerate(trace) if count <= 1)  # earlier starts were given up
     images, seconds = np.array(trace[first:], np.float64).T
     seconds = seconds - seconds[0]
     late = images >= images[-1] / 4
@@ -240,11 +247,11 @@ def draw(found: dict[str, Any], command: str) -> None:
     """Write SETS.md and its figure."""
     text = ["# Image sets", "", f"`{command}`", ""]
     text += [
-        "Wall time, which depends on what else the machine does, and CPU time of all threads, from images to "
-        "poses; ATE: root mean square after alignment; AUC: of the relative poses of all pairs. "
-        f"Of the videos (kitchen, d01, d04, d09) every {EVERY}rd frame, in shuffled order. COLMAP: its incremental "
-        "mapper with default options, the same tuned for small parallax, and its global mapper (tuned with a known "
-        "lens), all with SIFT on the CPU as here; a known lens is held fixed.", "",
+        "Wall time, which depends on other work of the machine, and CPU time of all threads, from images to poses; "
+        "ATE: root mean square after alignment; AUC: of the relative poses of all pairs. Videos (kitchen, d01, d04, "
+        f"d09): every {FRAME_STEP}rd frame, in random order. COLMAP: its incremental mapper with default options, the "
+        "same tuned for small parallax, and its global mapper (tuned if the lens is known), all with SIFT on the CPU "
+        "as here; a known lens is held fixed.", "",
         "| set | lens | method | images | ATE mm | AUC at 1° | wall s | CPU s | of COLMAP's CPU s |",
         "|---|---|---|---|---|---|---|---|---|",
     ]  # fmt: skip
@@ -260,18 +267,19 @@ def draw(found: dict[str, Any], command: str) -> None:
     traced = {key: r for key, r in found.items() if key.startswith("rendered")}
     if traced:
         text += [
-            "", f"A rendered room, {WIDTH}x{HEIGHT} pixels, known lens. ATE as a share of the path's extent of 2. CPU "
-            "time of the mapper and the polish; of everything, where the matches were made in the same run.", "",
+            "", f"A rendered room, {WIDTH}x{HEIGHT} pixels, known lens. ATE as a share of the extent of the path. CPU "
+            "s: of the whole run, if it made the matches; solving: of mapper and polish.", "",
             "| images | registered | points | ATE | wall s | by stage | CPU s | solving | peak MB | cost of an image |",
             "|---|---|---|---|---|---|---|---|---|---|",
         ]  # fmt: skip
         for r in sorted(traced.values(), key=lambda r: r["images"]):
             stages = ", ".join(f"{name} {value:.0f}" for name, value in r["seconds"].items())
+            share = r["ate"] / _RENDERED_EXTENT
             text.append(
-                f"| {r['images']} | {r['registered']} | {r['points']:,} | {r['ate'] / 2:.1e} | {r['total']:.0f} "
+                f"| {r['images']} | {r['registered']} | {r['points']:,} | {share:.1e} | {r['total']:.0f} "
                 f"| {stages} | {_everything(r)} | {_solving(r)} | {r['peak']:.0f} | {_cost(r)} |"
             )
-        if large := [r for r in traced.values() if r["images"] >= ENOUGH]:
+        if large := [r for r in traced.values() if r["images"] >= ENOUGH_IMAGES]:
             text += ["", "![Cost of an image against the registered images](sets_cost.png)"]
             _plot(large)
     (RESULTS / "SETS.md").write_text("\n".join(text) + "\n", encoding="utf-8")
@@ -282,7 +290,7 @@ def _millimetres(ate: float) -> str:
 
 
 def _everything(record: dict[str, Any]) -> str:
-    """CPU time, where the matches are not those of another run."""
+    """CPU seconds of the run, unless its matches are those of another run."""
     return f"{record['cpu']:.0f}" if record.get("matched", True) else "–"
 
 
@@ -291,8 +299,8 @@ def _solving(record: dict[str, Any]) -> str:
 
 
 def _cost(record: dict[str, Any]) -> str:
-    """How the cost of an image grows with the number of registered ones; few of them do not tell."""
-    return f"n^{growth(record['trace'])[2]:.2f}" if record["images"] >= ENOUGH else "–"
+    """How the cost of an image grows with the number n of registered ones, if there are enough."""
+    return f"n^{growth(record['trace'])[2]:.2f}" if record["images"] >= ENOUGH_IMAGES else "–"
 
 
 def _plot(records: list[dict[str, Any]]) -> None:
@@ -315,7 +323,7 @@ def _plot(records: list[dict[str, Any]]) -> None:
 
 
 def real_cases() -> list[Case]:
-    """The photographs and the videos."""
+    """The cases of photographs and videos."""
     lenses = (True, False)
     wide = [Case(n, m, known) for n in UNORDERED for known in lenses for m in ("COLMAP", "COLMAP global", "sift")]
     small = [
@@ -330,14 +338,14 @@ def real_cases() -> list[Case]:
 
 
 def main() -> None:
-    """Measure what is not measured yet and write the tables."""
+    """Measure the cases that have no result yet, and write the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--models", type=Path, required=True)
     parser.add_argument("--images", type=int, nargs="*", default=[40, 200], help="sizes of the rendered set")
     parser.add_argument("--work", type=Path, help="keep the rendered images, features and matches here")
-    parser.add_argument("--again", nargs="*", default=[], help="measure cases with this in their name again")
-    parser.add_argument("--only", default="", help="only cases with this in their name")
+    parser.add_argument("--again", nargs="*", default=[], help="measure cases again whose key contains one of these")
+    parser.add_argument("--only", default="", help="only cases whose key contains this")
     arguments = parser.parse_args()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that no measurement outlives the run
     stored = RESULTS / "sets.json"

@@ -1,4 +1,4 @@
-"""The cache: one record (JSON and NPZ) for each cell, under a key of everything that its result depends on."""
+"""The cache: one record (JSON and NPZ) per cell, under a key of everything on which its result depends."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ class Record:
 
     Attributes:
         cell: what was measured.
-        facts: plain data: `failed` (the reason, or None), `seconds` by stage with `total`, `cpu_seconds`,
-            `peak_mb`, `load` (of the machine at the start), `parallax`, `kind`, `notes`, `settings`, `points`.
-        arrays: `indices` (n,), `rotations` (n, 3, 3) and `centers` (n, 3) with NaN where not registered,
-            `true_rotations`, `true_centers`, of a stream `given_rotations` and `given_centers` as the poses were known
-            right after each frame, the errors `ate` (n,), `t_rpe`, `r_rpe` (n - 1,), and `depth`,
-            `true_depth` (m,) of the observed points in metres.
+        facts: plain data: `failed` (the reason, or None), `seconds` by stage with `total`, `cpu_seconds`, `peak_mb`,
+            `load` (of the machine at the start), `parallax`, `kind`, `notes`, `settings`, `points`.
+        arrays: `indices` (n,); `rotations` (n, 3, 3) and `centers` (n, 3), NaN for unregistered frames;
+            `true_rotations` and `true_centers`; `given_rotations` and `given_centers` of a stream, the causal poses;
+            the errors `ate` (n,), `t_rpe` and `r_rpe` (n - 1,); `depth` and `true_depth` (m,) of the observed points,
+            metres.
     """
 
     cell: Cell
@@ -48,13 +48,13 @@ class Record:
 
     @property
     def errors(self) -> TrajectoryErrors:
-        """Errors of the poses, from the poses, so that a change of the metrics needs no new run."""
+        """Errors of the poses; computed from the poses, so that a change of the metrics needs no new run."""
         a = self.arrays
         return trajectory_errors(a["rotations"], a["centers"], a["true_rotations"], a["true_centers"])
 
     @property
     def given_errors(self) -> TrajectoryErrors | None:
-        """Errors of the poses as they were given frame by frame; None where the method waits for the whole shot."""
+        """Errors of the causal poses; None if the method waits for the whole shot."""
         a = self.arrays
         if "given_centers" not in a:
             return None
@@ -62,7 +62,7 @@ class Record:
 
     @property
     def rotation_errors(self) -> Array:
-        """(n,) rotation error of every frame after alignment, degrees; inf where not registered."""
+        """(n,) rotation error of every frame after alignment, degrees; infinite for unregistered frames."""
         alignment = self.errors.alignment
         if alignment is None:
             return np.full(len(self.arrays["indices"]), np.inf)
@@ -71,15 +71,17 @@ class Record:
 
     @property
     def depth_errors(self) -> DepthErrors:
+        """Errors of the depths of the observed points."""
         return DepthErrors(self.arrays["depth"].astype(np.float64), self.arrays["true_depth"].astype(np.float64))
 
     @property
     def registered(self) -> int:
+        """Number of registered frames."""
         return int(np.isfinite(self.arrays["centers"]).all(axis=1).sum())
 
 
 def cell_key(cell: Cell, data: Path) -> str:
-    """Name of the record: the cell, its data, and the code that the method runs.
+    """Key of the record: a digest of the cell, its data and the code that the method runs.
 
     The code counts without imports, comments, docstrings and layout. A baseline depends only on pycolmap and the module
     of the baselines, so that other changes of factorsfm leave its records in the cache.
@@ -94,7 +96,7 @@ def cell_key(cell: Cell, data: Path) -> str:
 
 @cache
 def code_version(method: str) -> str:
-    """Fingerprint of the code that a method runs, with the versions of the libraries that decide."""
+    """Fingerprint of the code that a method runs, with the version of the library on which most depends."""
     if method in COLMAP:
         return f"{_fingerprint([_BASELINES])} pycolmap {version('pycolmap')}"
     ours = [path for path in sorted(PACKAGE.rglob("*.py")) if path.parent.name != "evaluation"]
@@ -102,12 +104,12 @@ def code_version(method: str) -> str:
 
 
 def record_path(cell: Cell, data: Path, cache_folder: Path) -> Path:
-    """The record's JSON file; its arrays lie beside it with the suffix .npz."""
+    """The JSON file of a record; its arrays are beside it, with the suffix .npz."""
     return cache_folder / cell.shot / f"{cell.variant}.{cell.method}.{cell.prior}.{cell_key(cell, data)}.json"
 
 
 def save(path: Path, record: Record) -> None:
-    """Write a record; the JSON file comes last and marks it as complete."""
+    """Write a record. The JSON file is written last, so that a record with one is complete."""
     path.parent.mkdir(parents=True, exist_ok=True)
     for target, write in ((path.with_suffix(".npz"), _write_arrays), (path, _write_facts)):
         scratch = target.with_name(f".{os.getpid()}.{target.name}")
@@ -116,6 +118,7 @@ def save(path: Path, record: Record) -> None:
 
 
 def load(path: Path) -> Record:
+    """Read the record with this JSON file."""
     facts = json.loads(path.read_text())
     with np.load(path.with_suffix(".npz")) as arrays:
         return Record(Cell(**facts.pop("cell")), facts, dict(arrays))

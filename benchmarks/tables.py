@@ -1,4 +1,4 @@
-"""Tables of all measurements, drawn from the cache: ``python -m benchmarks.tables`` draws them again."""
+"""The tables of all measurements, from the records in the cache: ``python -m benchmarks.tables`` draws them again."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ DEPTH = (
 
 
 def draw(output: Path, cache: Path) -> None:
-    """Write RESULTS.md and the figures for the experiments in the manifest of the output folder."""
+    """Write RESULTS.md and the figures of the experiments in the manifest of the output folder."""
     manifest = json.loads((output / "manifest.json").read_text())
     experiments = {name: [load(cache / record) for record in facts["records"]] for name, facts in manifest.items()}
     parts = ["# Results", _provenance(manifest, experiments)]
@@ -61,7 +61,7 @@ def draw(output: Path, cache: Path) -> None:
 
 
 def pose_table(records: Records) -> str:
-    """The six AUC columns by method and prior, pooled over all frames of the shots."""
+    """The six AUC columns by method and prior, pooled over all frames."""
     rows = []
     for label, members in by_label(records).items():
         frames = sum(len(r.arrays["indices"]) for r in members)
@@ -72,7 +72,7 @@ def pose_table(records: Records) -> str:
 
 
 def given_table(records: Records) -> list[str]:
-    """The six AUC columns of the poses as they were known right after each frame; nothing where no method gives any."""
+    """The six AUC columns of the causal poses; empty if no method has any."""
     rows = [
         [*_names(label), len(members), *columns]
         for label, members in by_label(records).items()
@@ -81,7 +81,7 @@ def given_table(records: Records) -> list[str]:
     if not rows:
         return []
     return [
-        "As they were given frame by frame; a frame for which the method still waits counts as an infinite error.",
+        "Causal poses, as given frame by frame; a frame that waits for its pose counts as an infinite error.",
         table(["method", "prior", "shots", *POSE], rows, max),
     ]
 
@@ -110,8 +110,8 @@ def _pose(records: Records, output: Path) -> list[str]:
     variants = [r for r in records if r.cell.method not in COLMAP]
     parts = [
         "Area under the recall curve in percent, pooled over all frames; a frame that is not registered counts as an "
-        "infinite error. The best of each column is bold. Depths take their scale from the alignment of the paths; at "
-        "its own scale means that their median ratio to the truth is made 1.",
+        "infinite error. The best of each column is bold. The alignment of the paths scales the depths; at its own "
+        "scale, they are scaled to a median ratio of 1 to the truth.",
         "### All shots",
         pose_table(main),
     ]
@@ -141,7 +141,7 @@ def _pose(records: Records, output: Path) -> list[str]:
 
 
 def _real(records: Records, output: Path) -> list[str]:
-    """Median errors and the AUC of relative poses, shot by shot: references differ too much for pooling."""
+    """Median errors and AUC of relative poses, shot by shot; the references are too different to be pooled."""
     rows = []
     for shot, members in by_shot(records).items():
         for label, (record,) in by_label(members).items():
@@ -177,11 +177,11 @@ def _edge(records: Records, output: Path) -> list[str]:
                 ]
             )
     header = ["shot", "method", "prior", "frames", "rotation error °, median", "largest", "reported as", "notes"]
-    return ["A camera that only turns, and one that stands still.", table(header, rows)]
+    return ["A camera that only rotates, and one that does not move.", table(header, rows)]
 
 
 def _split(records: Records, output: Path) -> list[str]:
-    """Rendered shots and kitchen clips apart, pooled and shot by shot."""
+    """Tables of the rendered shots and of the kitchen clips."""
     parts = []
     for title, shots in (("Rendered shots", STUDIO), ("Kitchen clips", KITCHEN)):
         if members := [r for r in records if r.cell.shot in shots]:
@@ -206,7 +206,7 @@ def _networks(records: Records, output: Path) -> list[str]:
     for title, rendered in (("Rendered shots", True), ("Real sets with sensor depth", False)):
         if members := [r for r in records if (r.cell.shot in STUDIO) == rendered]:
             parts += [f"### {title}", pose_table(members)]
-    return [*parts, "The depth of the points under the sensor's prior is judged against that same sensor."]
+    return [*parts, "With the sensor as prior, the depth of the points is compared with the same sensor."]
 
 
 SECTIONS: Mapping[str, tuple[str, Callable[[Records, Path], list[str]]]] = {
@@ -231,8 +231,8 @@ def _cost(experiments: Mapping[str, Records]) -> list[str]:
         return []
     parts = [
         "## Time and memory",
-        "From the video to the written result. Wall time depends on what else the machine does (its load at the start "
-        "is given), CPU time hardly. COLMAP's matching counts for each of its mappers, whose measurement shares it.",
+        "From the video to the written result. Wall time depends on other work of the machine, whose load at the start "
+        "is given; CPU time hardly does. The mappers of COLMAP share their matching, which counts for each of them.",
         "### Mean by method",
     ]
     stages: dict[str, None] = {}
@@ -287,7 +287,7 @@ def _provenance(manifest: Mapping[str, Any], experiments: Mapping[str, Records])
     )
     return "\n\n".join(
         [
-            "Generated by `python -m benchmarks.run`; a + marks a commit with changes that are not committed.",
+            "Generated by `python -m benchmarks.run`; + marks a commit with uncommitted changes.",
             table(["experiment", "commit", "date", "cells", "command"], rows),
             *(f"Machine: {machine}." for machine in machines),
             *(f"Versions: {numbers}." for numbers in versions),

@@ -1,4 +1,4 @@
-"""CPU time and memory of this process together with those that it has started, such as the graph's."""
+"""CPU time and memory of this process and of its child processes, such as that of the graph."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from pathlib import Path
 
 
 def cpu_seconds() -> float:
-    """Of all of them so far, ended ones included."""
+    """CPU time of all of them so far, also of those that have ended."""
     usage = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     running = sum(_ticks(child) for child in _children()) / os.sysconf("SC_CLK_TCK")
     return sum(u.ru_utime + u.ru_stime for u in usage) + running
 
 
 def peak_mb() -> float:
-    """Sum of the peaks of those that run; what they share counts for each."""
+    """Sum of the peak memory of the running ones; shared memory counts for each."""
     return _status_mb("VmHWM")
 
 
 def resident_mb() -> float:
-    """Sum over those that run now; what they share counts for each."""
+    """Sum of the present memory of the running ones; shared memory counts for each."""
     return _status_mb("VmRSS")
 
 
@@ -40,7 +40,7 @@ def _status_mb(name: str) -> float:
 
 
 def _read(path: Path) -> str:
-    """Nothing where the thread or process has ended meanwhile."""
+    """The text of a file; empty if its thread or process has ended."""
     try:
         return path.read_text()
     except (FileNotFoundError, ProcessLookupError):

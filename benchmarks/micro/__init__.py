@@ -1,0 +1,1 @@
+"""What the parts cost, on rendered and synthetic input: ``python -m benchmarks.micro [--models FOLDER]``."""
