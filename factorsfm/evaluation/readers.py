@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import json
 import logging
 import re
 from collections import Counter
@@ -22,6 +21,7 @@ from factorsfm.evaluation.truth import DepthLookup, DepthMaps, RawDepthMaps, Sho
 from factorsfm.frames.folders import list_files, list_images, read_image
 from factorsfm.frames.video import VIDEO_SUFFIXES
 from factorsfm.support.errors import InputError
+from factorsfm.support.json_reading import read_json
 from factorsfm.support.rotations import nearest_rotation
 from factorsfm.support.similarity import pose_arrays
 
@@ -49,7 +49,7 @@ def read_shot(folder: str | Path, unit: float = 1.0) -> Shot:
     """
     folder = Path(folder)
     camera = read_camera(folder / "camera.json")
-    facts = json.loads(_read_text(folder / "camera.json"))
+    facts = read_json(folder / "camera.json", "camera file")
     table = _read_table(folder / "groundtruth.txt", columns=8)
     depth: DepthLookup = no_depth
     if (folder / "depth").is_dir():

@@ -1,1 +1,4 @@
-"""What every room may import: errors, options, statuses, threads, rotations, similarities. Imports no other room."""
+"""What every room may import: errors, options, statuses, JSON, threads, and small pieces of geometry.
+
+Imports no other room.
+"""

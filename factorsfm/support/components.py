@@ -9,10 +9,11 @@ Index = NDArray[np.int64]
 
 
 def connected_components(count: int, edges: Index) -> Index:
-    """(count,) smallest node of the connected component of each node.
+    """(count,) label of the connected component of each node: the smallest node in it.
 
     Args:
-        count: of the nodes; edges: (e, 2) pairs of nodes.
+        count: number of nodes.
+        edges: (e, 2) pairs of nodes.
     """
     label = np.arange(count)
     while True:

@@ -1,4 +1,4 @@
-"""Names of images, which other programs and exports take as paths below a folder."""
+"""Names of images, which exports and other programs use as paths inside a folder."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ _DRIVE = re.compile(r"[A-Za-z]:")
 
 
 def check_name(name: str) -> None:
-    """Insist that an image of this name lies in its folder, on every system.
+    """Check that the name of an image is a path inside its folder, on every system.
 
     Raises:
-        InputError: it is an absolute path, has a drive letter, or goes up.
+        InputError: it is an absolute path, or has a drive letter or "..".
     """
     parts = {*PurePosixPath(name).parts, *PureWindowsPath(name).parts}
     if ".." in parts or name.startswith(("/", "\\")) or _DRIVE.match(name) or "\0" in name:

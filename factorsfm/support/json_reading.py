@@ -1,4 +1,4 @@
-"""JSON files read back: the file itself, and plain values as typed ones."""
+"""Reading of JSON: files, and the conversion of plain values to dataclasses."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ _LARGEST_WHOLE = 2**63
 
 
 def read_json(path: str | Path, what: str) -> Any:
-    """The content of a JSON file. A whole number that does not fit in 64 bits becomes a float.
+    """The content of a JSON file; a whole number beyond 64 bits becomes a float.
 
     Args:
-        what: the file is, for the message.
+        what: kind of the file, for the error message.
 
     Raises:
         InputError: the file cannot be read, or is not JSON.
@@ -36,16 +36,16 @@ def read_json(path: str | Path, what: str) -> Any:
 
 
 def typed(kind: type[T], value: Any, where: str) -> T:
-    """A plain value as what it was before `json_text`: the reverse of `asdict` for a dataclass.
+    """Convert a plain value of JSON to a type; for a dataclass, this is the inverse of `asdict` and `json_text`.
 
-    Takes dataclasses, enumerations, literals, lists, dictionaries with text keys, text, numbers, truth values, None and
-    unions with None. Further keys of an object are ignored. A number that is null is NaN.
+    The type is a dataclass, an enumeration, a literal, a list, a dictionary with text keys, text, a number, a boolean,
+    or one of these or None. Further keys of an object are ignored. null becomes NaN where a number is expected.
 
     Args:
-        where: what the value is, for the message.
+        where: name of the value, for the error message.
 
     Raises:
-        InputError: the value is of another kind, or a key is missing.
+        InputError: the value has another type, or a key is missing.
     """
     result: T = _typed(kind, value, where)
     return result

@@ -1,4 +1,4 @@
-"""How long the stages of a reconstruction take."""
+"""Time of the stages of a reconstruction."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class StageSeconds(defaultdict[str, float]):
 
     @contextmanager
     def of(self, stage: str) -> Iterator[None]:
-        """Count what is done inside to a stage."""
+        """Add the time inside the ``with`` statement to a stage."""
         start = time.perf_counter()
         try:
             yield
