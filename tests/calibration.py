@@ -19,6 +19,12 @@ def normalised(error, covariance):
     return error @ np.linalg.solve(covariance, error), len(error)
 
 
+def unit_direction(state):
+    """(6 (k - 1),) how the poses of all cameras but the first change where the unit of length grows."""
+    moved = -state.translation[1:]
+    return np.concatenate([np.zeros_like(moved), moved], axis=1).ravel()
+
+
 def without_unit(error, covariance, direction):
     """Error and covariance on the complement of the direction in which the unit of length is free."""
     basis = np.linalg.svd(direction[None])[2][1:]

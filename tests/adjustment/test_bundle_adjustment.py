@@ -18,7 +18,7 @@ from factorsfm.graph.factors import (
     virtual_offset,
 )
 from factorsfm.support.options import PolishOptions
-from tests.calibration import assert_calibrated, normalised, pose_errors, without_unit
+from tests.calibration import assert_calibrated, normalised, pose_errors, unit_direction, without_unit
 from tests.estimation_problems import FIELD, angles_between, in_unit_of, make_problem, perturbed, with_prior
 
 # A tight tolerance and hardly any prior on the points: the optimum is that of the reprojections (and the prior).
@@ -369,8 +369,8 @@ def test_the_covariance_is_calibrated_up_to_the_unit(motion):
         some = np.arange(0, len(problem.points), 5)
         marginals = adjustment.marginals()
         camera, covariance = marginals.camera, marginals.inverse_distances(some)
-        unit = np.concatenate([np.zeros((4, 3)), -state.translation[1:]], 1).ravel()
-        poses.append(normalised(*without_unit(pose_errors(state, truth), camera[6:30, 6:30], unit)))
+        free = without_unit(pose_errors(state, truth), camera[6:30, 6:30], unit_direction(state))
+        poses.append(normalised(*free))
         difference = (state.inverse_distance - truth.inverse_distance)[some]
         points.append(normalised(*without_unit(difference, covariance, state.inverse_distance[some])))
     assert_calibrated(poses, 0.79)

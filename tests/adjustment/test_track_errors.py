@@ -8,6 +8,7 @@ from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import ErrorModel
 from factorsfm.adjustment.track_errors import STRETCH, measure_track_errors
 from factorsfm.support.options import PolishOptions
+from tests.calibration import assert_calibrated, normalised, pose_errors, unit_direction, without_unit
 from tests.estimation_problems import angles_between, in_unit_of, make_problem
 
 OPTIONS = PolishOptions(iterations=30, tolerance=1e-10, point_sigma=1e3)
@@ -104,25 +105,29 @@ def test_the_normal_equations_are_those_of_the_dense_information_matrix(shot):
         np.testing.assert_allclose(cross, expected, atol=1e-10 * scale)
 
 
-def test_cameras_are_better_and_their_covariance_is_honest(shot):
-    """Against least squares that take the errors of a track as independent."""
-    worse, better, normalized = [], [], []
-    frames = shot.frames
-    for seed in range(6):
+def test_cameras_are_better_and_their_covariance_is_calibrated(shot):
+    """Beside least squares that take the errors of a track as independent, and promise too much."""
+    options = replace(OPTIONS, tolerance=1e-5)
+    errors = {"independent": [], "persistent": []}
+    normalised_errors = {"independent": [], "persistent": []}
+    for seed in range(4):
         rng = np.random.default_rng([seed, 5])
         seen = with_errors(shot, drawn(shot.observations, 0.5 * rng.choice([0.05, 1.0], len(shot.points)), seed))
-        plain = BundleAdjustment(shot.truth, seen, OPTIONS, ErrorModel(WHITE))
+        plain = BundleAdjustment(shot.truth, seen, options, ErrorModel(WHITE))
         plain.solve()
-        errors = measure_track_errors(plain.reprojection_vectors(), seen, 100.0)
-        aware = BundleAdjustment(plain.state, seen, OPTIONS, ErrorModel(errors.sigma, errors))
+        measured = measure_track_errors(plain.reprojection_vectors(), seen, 100.0)
+        aware = BundleAdjustment(plain.state, seen, options, ErrorModel(measured.sigma, measured))
         aware.solve()
-        for adjustment, collected in ((plain, worse), (aware, better)):
+        for kind, adjustment in (("independent", plain), ("persistent", aware)):
             state = in_unit_of(adjustment.state, shot.truth)
-            collected.append(np.sqrt((angles_between(state.rotation, shot.truth.rotation) ** 2).mean()))
-        variance = aware.marginals().camera.diagonal()[: 6 * frames].reshape(frames, 6)[1:, :3].sum(1)
-        normalized.append(angles_between(aware.state.rotation, shot.truth.rotation)[1:] ** 2 / variance)
-    assert np.mean(better) < 0.8 * np.mean(worse)
-    assert 0.3 < np.mean(normalized) < 3.0
+            errors[kind].append(np.sqrt((angles_between(state.rotation, shot.truth.rotation) ** 2).mean()))
+            covariance = adjustment.marginals().camera[6 : 6 * shot.frames, 6 : 6 * shot.frames]
+            free = without_unit(pose_errors(state, shot.truth), covariance, unit_direction(state))
+            normalised_errors[kind].append(normalised(*free))
+    assert 0.35 < np.mean(errors["persistent"]) / np.mean(errors["independent"]) < 0.6
+    assert_calibrated(normalised_errors["persistent"])
+    total, freedom = np.sum(normalised_errors["independent"], axis=0)
+    assert 1.2 < total / freedom < 1.5
 
 
 def test_without_what_persists_the_weights_are_those_of_the_kernel(shot):
