@@ -124,11 +124,11 @@ def test_the_gradient_is_that_of_the_cost(kernel):
         return (costs[0] - costs[1]) / (2 * step)
 
     camera = [slope(column) for column in taking_part]
-    np.testing.assert_allclose(normal.camera_gradient[taking_part], camera, rtol=1e-5, atol=1e-5 * np.abs(camera).max())
-    assert (np.abs(camera) > 1e-3).all()  # every one of them takes part
+    np.testing.assert_allclose(normal.camera_gradient[taking_part], camera, rtol=1e-6, atol=1e-6 * np.abs(camera).max())
+    assert (np.abs(camera) > 0.5).all()  # every one of them takes part
     assert not normal.camera_gradient[adjustment.columns.lens].any()
     points = np.array([[slope(column, row) for column in range(3)] for row in range(n)])
-    np.testing.assert_allclose(normal.point_gradient, points, rtol=1e-5, atol=1e-5 * np.abs(points).max())
+    np.testing.assert_allclose(normal.point_gradient, points, rtol=1e-6, atol=1e-6 * np.abs(points).max())
 
 
 def test_the_step_solves_the_whole_system():
@@ -155,18 +155,18 @@ def test_the_step_solves_the_whole_system():
     expected = -np.linalg.solve(full[np.ix_(free, free)], gradient[free])
     camera, point = adjustment._step(normal, adjustment._elimination.cross_blocks(normal), 0.0, _newton_step)
     np.testing.assert_array_equal(np.delete(camera, mine), 0.0)
-    np.testing.assert_allclose(np.append(camera[mine], point), expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max())
+    np.testing.assert_allclose(np.append(camera[mine], point), expected, rtol=1e-8, atol=1e-10 * np.abs(expected).max())
     inverse = np.linalg.inv(full[np.ix_(free, free)])
     chosen = np.array([0, 7, n - 1])
     marginals = adjustment.marginals()
     camera_covariance, covariance = marginals.camera, marginals.inverse_distances(chosen)
     cameras = inverse[: len(mine), : len(mine)]
     np.testing.assert_allclose(
-        camera_covariance[np.ix_(mine, mine)], cameras, rtol=1e-4, atol=1e-8 * cameras.max()
+        camera_covariance[np.ix_(mine, mine)], cameras, rtol=1e-7, atol=1e-11 * cameras.max()
     )  # fmt: skip
     rows = len(mine) + 3 * chosen + 2
     np.testing.assert_allclose(
-        covariance, inverse[np.ix_(rows, rows)], rtol=1e-4, atol=1e-8 * inverse[rows, rows].max()
+        covariance, inverse[np.ix_(rows, rows)], rtol=1e-8, atol=1e-12 * inverse[rows, rows].max()
     )
 
 
@@ -178,16 +178,16 @@ def test_noise_free_shots_are_recovered_exactly(motion):
     problem = make_problem(motion)
     adjustment = BundleAdjustment(perturbed(problem.truth), problem.observations, EXACT, ErrorModel(0.25))
     state = adjustment.solve()
-    assert_cameras(state, problem.truth, angle_rad=1e-6, distance=1e-6)
-    assert np.median(adjustment.reprojection_errors()) < 1e-5
+    assert_cameras(state, problem.truth, angle_rad=2e-10, distance=1e-8)
+    assert np.median(adjustment.reprojection_errors()) < 1e-6
     state = in_unit_of(state, problem.truth)
-    np.testing.assert_allclose(state.inverse_distance, problem.truth.inverse_distance, atol=1e-3)
+    np.testing.assert_allclose(state.inverse_distance, problem.truth.inverse_distance, atol=2e-8)
 
 
 def test_the_default_options_come_within_their_weak_prior():
     problem = make_problem("handheld", parallax=0.03)
     adjustment = BundleAdjustment(perturbed(problem.truth), problem.observations, PolishOptions(), ErrorModel(0.25))
-    assert_cameras(adjustment.solve(), problem.truth, angle_rad=2e-5, distance=1e-4)
+    assert_cameras(adjustment.solve(), problem.truth, angle_rad=4e-6, distance=4e-6)
 
 
 def test_pure_rotation_without_translation():
@@ -195,9 +195,9 @@ def test_pure_rotation_without_translation():
     start = perturbed(problem.truth, shift=0.0)
     adjustment = BundleAdjustment(start, problem.observations, EXACT, ErrorModel(0.25), free=Free(translation=False))
     state = adjustment.solve()
-    assert angles_between(state.rotation, problem.truth.rotation).max() < 1e-7
+    assert angles_between(state.rotation, problem.truth.rotation).max() < 1e-13
     np.testing.assert_array_equal(state.translation, start.translation)
-    np.testing.assert_allclose(state.bearing, problem.truth.bearing, atol=1e-7)
+    np.testing.assert_allclose(state.bearing, problem.truth.bearing, rtol=0.0, atol=1e-13)
     np.testing.assert_array_equal(state.inverse_distance, start.inverse_distance)  # says nothing, so it stays
 
 
@@ -208,8 +208,10 @@ def test_translation_is_held_where_asked():
     state = adjustment.solve()
     turned = state.rotation @ np.swapaxes(start.rotation, 1, 2)
     # The camera turns about its own centre.
-    np.testing.assert_allclose(state.translation, np.einsum("kij,kj->ki", turned, start.translation), atol=1e-12)
-    assert angles_between(state.rotation, start.rotation).max() > 1e-4
+    np.testing.assert_allclose(
+        state.translation, np.einsum("kij,kj->ki", turned, start.translation), rtol=0.0, atol=1e-14
+    )
+    assert 0.02 < angles_between(state.rotation, start.rotation).max() < 0.12
 
 
 @pytest.mark.parametrize("factor", [0.93, 1.08])
@@ -220,11 +222,12 @@ def test_the_focal_length_is_recovered(factor):
     normalized = Observations(o.frame, o.point, o.xy / factor)
     adjustment = BundleAdjustment(guess, normalized, EXACT, ErrorModel(0.25), free=Free(focal=True))
     state = adjustment.solve()
-    assert np.exp(state.log_focal) == pytest.approx(problem.focal, rel=1e-5)
-    assert_cameras(state, problem.truth, angle_rad=1e-5, distance=1e-5)
+    np.testing.assert_allclose(np.exp(state.log_focal), problem.focal, rtol=2e-9)
+    assert_cameras(state, problem.truth, angle_rad=2e-10, distance=1e-10)
     held = BundleAdjustment(guess, normalized, EXACT, ErrorModel(0.25))
     assert held.solve().log_focal == guess.log_focal
-    assert held.cost() > 100 * adjustment.cost() + 1.0
+    assert held.cost() > 10.0
+    assert adjustment.cost() < 1e-6 * held.cost()
 
 
 def test_groups_of_focal_lengths_are_recovered():
@@ -236,9 +239,9 @@ def test_groups_of_focal_lengths_are_recovered():
     normalized = Observations(o.frame, o.point, o.xy / factor[group[o.frame], None])
     adjustment = BundleAdjustment(guess, normalized, EXACT, ErrorModel(0.25), free=Free(focal=True))
     state = adjustment.solve()
-    np.testing.assert_allclose(np.exp(state.log_focal), problem.focal, rtol=1e-5)
+    np.testing.assert_allclose(np.exp(state.log_focal), problem.focal, rtol=1e-9)
     np.testing.assert_array_equal(state.group, group)
-    assert_cameras(state, problem.truth, angle_rad=1e-5, distance=1e-5)
+    assert_cameras(state, problem.truth, angle_rad=2e-10, distance=1e-10)
     held = BundleAdjustment(guess, normalized, EXACT, ErrorModel(0.25))
     np.testing.assert_array_equal(held.solve().log_focal, guess.log_focal)
 
@@ -260,8 +263,8 @@ def test_what_is_known_of_the_focal_lengths_holds_them_together():
             known=Known(focal=FocalPrior(truth.log_focal, step.T @ step / sigma**2)),
         )
         spreads.append(np.ptp(adjustment.solve().log_focal))
-    assert spreads[0] > 1e-3
-    assert spreads[1] < 1e-5
+    assert 1e-3 < spreads[0] < 2e-3
+    assert spreads[1] < 2e-10
 
 
 def test_points_only_holds_the_cameras():
@@ -274,7 +277,7 @@ def test_points_only_holds_the_cameras():
     state = adjustment.solve()
     for name in ("rotation", "translation", "log_focal", "scale", "shift", "field"):
         np.testing.assert_array_equal(getattr(state, name), getattr(start, name))
-    np.testing.assert_allclose(state.points, problem.points, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(state.points, problem.points, rtol=0.0, atol=1e-11)
 
 
 def test_the_prior_gives_depth_where_geometry_has_none():
@@ -282,9 +285,9 @@ def test_the_prior_gives_depth_where_geometry_has_none():
     prior, truth = with_prior(problem, [0, 5, 9], noise=0.01, scale_std=0.01, shift_std=0.01)
     adjustment = BundleAdjustment(start_of(truth), problem.observations, PolishOptions(), ErrorModel(0.1), prior=prior)
     state = in_unit_of(adjustment.solve(), truth)
-    assert np.abs(state.inverse_distance - truth.inverse_distance).max() < 0.05
-    assert np.abs(adjustment.prior_residuals()).max() < 0.06
-    assert np.linalg.norm(state.translation, axis=1).max() < 2e-3
+    assert np.abs(state.inverse_distance - truth.inverse_distance).max() < 0.03
+    assert 0.01 < np.abs(adjustment.prior_residuals()).max() < 0.05
+    assert np.linalg.norm(state.translation, axis=1).max() < 5e-4
 
 
 def test_outliers_hardly_move_the_solution():
@@ -295,9 +298,9 @@ def test_outliers_hardly_move_the_solution():
     problem.observations.xy[wild] += rng.normal(0, 0.03, (wild.sum(), 2))
     robbed = BundleAdjustment(perturbed(problem.truth), problem.observations, EXACT, ErrorModel(0.1))
     state = robbed.solve()
-    assert_cameras(clean, problem.truth, angle_rad=5e-4, distance=2e-3)
-    assert_cameras(state, problem.truth, angle_rad=5e-4, distance=2e-3)
-    assert np.median(robbed.reprojection_errors()[wild]) > 5.0
+    assert_cameras(clean, problem.truth, angle_rad=5e-4, distance=5e-4)
+    assert_cameras(state, problem.truth, angle_rad=5e-4, distance=5e-4)
+    assert np.median(robbed.reprojection_errors()[wild]) > 12.0
 
 
 def test_reprojection_vectors_are_predicted_minus_observed():
@@ -306,8 +309,8 @@ def test_reprojection_vectors_are_predicted_minus_observed():
     adjustment = BundleAdjustment(problem.truth, problem.observations, EXACT, ErrorModel(0.25))
     expected = np.zeros((len(problem.observations.xy), 2))
     expected[3] = -problem.focal * np.array([0.01, -0.02])
-    np.testing.assert_allclose(adjustment.reprojection_vectors(), expected, atol=1e-8)
-    np.testing.assert_allclose(adjustment.reprojection_errors(), np.linalg.norm(expected, axis=1), atol=1e-8)
+    np.testing.assert_allclose(adjustment.reprojection_vectors(), expected, rtol=0.0, atol=1e-11)
+    np.testing.assert_allclose(adjustment.reprojection_errors(), np.linalg.norm(expected, axis=1), rtol=0.0, atol=1e-11)
 
 
 def test_unsorted_observations_are_refused():

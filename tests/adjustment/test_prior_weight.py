@@ -101,7 +101,7 @@ def test_outliers_do_not_decide():
     prior[::20] += 5.0
     weight = measure_weight(angles, inverse, prior, 1e-4 * np.eye(len(inverse)))
     assert 0.05 < weight.local < 0.2
-    assert weight.smooth < 0.3
+    assert 0.03 < weight.smooth < 0.16
 
 
 # --- the field --------------------------------------------------------------------------------------------------
@@ -127,7 +127,7 @@ def test_the_field_and_the_rest_have_the_variance_of_the_model():
     weight = PriorWeight(0.2, 0.05, 0.3, 0.9)
     nodes, weights, information, rest = field_grid(angles, weight)
     covariance = np.linalg.inv(information)
-    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), 0.2, rtol=1e-3)
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), 0.2, rtol=2e-6)
     assert (rest >= 0.05).all()
     assert (rest < np.hypot(0.05, 0.2)).all()
     # What the nodes do not carry is in the rest: nodes plus rest vary as the field and the local error together.
@@ -136,7 +136,7 @@ def test_the_field_and_the_rest_have_the_variance_of_the_model():
     distance = np.linalg.norm(angles[:, None] - angles[None], axis=2)
     true = 0.2**2 * np.exp(-distance / weight.length)
     modelled = mapping @ covariance @ mapping.T + np.diag(rest**2 - 0.05**2)
-    np.testing.assert_allclose(np.diag(modelled), np.diag(true), rtol=0.35)
+    np.testing.assert_allclose(np.diag(modelled), np.diag(true), rtol=0.1)
     far = distance > 0.15
     np.testing.assert_allclose(modelled[far], true[far], atol=0.1 * 0.2**2)
 
@@ -144,4 +144,4 @@ def test_the_field_and_the_rest_have_the_variance_of_the_model():
 def test_a_precise_prior_has_a_stiff_field():
     angles, _, _ = scene()
     stiff, loose = (field_grid(angles, PriorWeight(smooth, 0.05, 0.3, 0.9))[2] for smooth in (0.02, 0.5))
-    np.testing.assert_allclose(stiff, loose * 25**2, rtol=1e-6)
+    np.testing.assert_allclose(stiff, loose * 25**2, rtol=2e-9)

@@ -42,7 +42,7 @@ def test_what_persists_is_measured():
     ratio = errors.shared / (1.0 - STRETCH * errors.shared)  # with unit weights
     measured = WHITE * np.sqrt(ratio.reshape(tracks, -1)[:, 0].reshape(3, -1).mean(1))
     assert measured[0] < 0.04
-    assert measured[1] == pytest.approx(0.1, rel=0.15)
+    assert measured[1] == pytest.approx(0.1, rel=0.05)
     assert measured[2] == pytest.approx(0.3, rel=0.15)
 
 
@@ -50,8 +50,8 @@ def test_of_independent_errors_hardly_anything_is_taken_for_persistent(shot):
     o = shot.observations
     error = drawn(o, np.zeros(len(shot.points)))
     errors = measure_track_errors(error, o, 2.0)
-    assert (errors.shared * STRETCH).mean() < 0.15
-    assert errors.sigma == pytest.approx(WHITE, rel=0.05)
+    assert 0.03 < (errors.shared * STRETCH).mean() < 0.15
+    assert errors.sigma == pytest.approx(WHITE, rel=0.02)
 
 
 def problem_with_persistent_errors(shot, size, seed=0):
@@ -71,13 +71,13 @@ def test_the_gradient_is_that_of_the_cost(shot):
         cameras[column] = step
         costs = [adjustment._cost(adjustment._retract(sign * cameras, points)) for sign in (1.0, -1.0)]
         cameras[column] = 0.0
-        assert (costs[0] - costs[1]) / (2 * step) == pytest.approx(normal.camera_gradient[column], rel=1e-4)
+        assert (costs[0] - costs[1]) / (2 * step) == pytest.approx(normal.camera_gradient[column], rel=1e-7)
     for point, axis in ((0, 0), (7, 1), (30, 2)):
         points[point, axis] = step
         costs = [adjustment._cost(adjustment._retract(cameras, sign * points)) for sign in (1.0, -1.0)]
         points[point, axis] = 0.0
         # What holds the point near its start is not part of the gradient at the start.
-        assert (costs[0] - costs[1]) / (2 * step) == pytest.approx(normal.point_gradient[point, axis], rel=1e-4)
+        assert (costs[0] - costs[1]) / (2 * step) == pytest.approx(normal.point_gradient[point, axis], rel=1e-6)
 
 
 def test_the_normal_equations_are_those_of_the_dense_information_matrix(shot):
@@ -96,13 +96,13 @@ def test_the_normal_equations_are_those_of_the_dense_information_matrix(shot):
         weight[np.ix_(rows, rows)] -= errors.shared[g] * np.outer(root, root)
     dense = sum(jacobian[d].T @ weight @ jacobian[d] for d in range(2))
     scale = np.abs(dense).max()
-    np.testing.assert_allclose(normal.camera, dense[:c, :c], atol=1e-10 * scale)
+    np.testing.assert_allclose(normal.camera, dense[:c, :c], atol=1e-14 * scale)
     for j in range(len(shot.points)):
         here = slice(c + 3 * j, c + 3 * j + 3)
-        np.testing.assert_allclose(normal.point[j], dense[here, here], atol=1e-6 * scale)
+        np.testing.assert_allclose(normal.point[j], dense[here, here], atol=1e-14 * scale)
     for cross, columns, span in adjustment._elimination.cross_blocks(normal):
         expected = dense[columns, c + 3 * span.start : c + 3 * span.stop]
-        np.testing.assert_allclose(cross, expected, atol=1e-10 * scale)
+        np.testing.assert_allclose(cross, expected, atol=1e-14 * scale)
 
 
 def test_cameras_are_better_and_their_covariance_is_calibrated(shot):
@@ -138,4 +138,4 @@ def test_without_what_persists_the_weights_are_those_of_the_kernel(shot):
     independent = replace(errors, sigma=WHITE, shared=np.zeros_like(errors.shared))
     weighted = BundleAdjustment(shot.truth, seen, OPTIONS, ErrorModel(WHITE, independent))
     expected, found = plain._linearize(), weighted._linearize()
-    np.testing.assert_allclose(found.camera, expected.camera, rtol=0.05, atol=0.02 * np.abs(expected.camera).max())
+    np.testing.assert_allclose(found.camera, expected.camera, rtol=0.01, atol=0.004 * np.abs(expected.camera).max())

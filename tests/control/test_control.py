@@ -48,6 +48,7 @@ from factorsfm.evaluation.readers import read_shot
 from factorsfm.polish.polish import Polished, polish
 from factorsfm.support.similarity import Similarity, align, pose_arrays
 from factorsfm.synthetic import render_shot, write_shot
+from tests.calibration import assert_calibrated, normalised
 from tests.command_line import assert_error
 from tests.estimation_problems import Problem, centers, make_problem, mapped_images, perturbed, rotation_matrices
 
@@ -102,8 +103,8 @@ def test_each_residual_has_the_derivative_of_its_value(number: int) -> None:
             moved = adjustment._retract(step, np.zeros((len(state.bearing), 3)))
             values.append(item.linearized(term.view(moved))[0])
         numeric[:, at] = (values[0] - values[1]) / 2e-6
-    np.testing.assert_allclose(derivative, numeric, rtol=1e-5, atol=1e-6 * np.abs(numeric).max())
-    assert (np.abs(numeric).max(axis=0) > 1e-4).all()  # every column takes part
+    np.testing.assert_allclose(derivative, numeric, rtol=1e-8, atol=1e-9 * np.abs(numeric).max())
+    assert (np.abs(numeric).max(axis=0) > 1.0).all()  # every column takes part
 
 
 def test_the_gradient_of_the_adjustment_is_that_of_its_cost() -> None:
@@ -122,7 +123,7 @@ def test_the_gradient_of_the_adjustment_is_that_of_its_cost() -> None:
         numeric[column] = (costs[0] - costs[1]) / 2e-6
     varied = np.delete(np.arange(size), adjustment.columns.optics)  # the lens is settled before
     found, numeric = normal.camera_gradient[varied], numeric[varied]
-    np.testing.assert_allclose(found, numeric, rtol=1e-5, atol=1e-5 * np.abs(numeric).max())
+    np.testing.assert_allclose(found, numeric, rtol=1e-6, atol=1e-6 * np.abs(numeric).max())
 
 
 def test_the_control_does_not_know_the_unit_of_the_polish() -> None:
@@ -143,7 +144,7 @@ def test_the_control_does_not_know_the_unit_of_the_polish() -> None:
     moved = adjustment._retract(1e-4 * seen["motion"], np.zeros((len(state.bearing), 3)))
     for old, new in zip(before, term.residuals(moved), strict=True):
         np.testing.assert_allclose(new, old, atol=1e-6 * max(1.0, float(np.abs(old).max())))
-    assert np.abs(moved.translation - state.translation).max() > 1e-6
+    assert 5e-6 < np.abs(moved.translation - state.translation).max() < 3e-5
 
 
 # --- exact truth ------------------------------------------------------------------------------------------------
@@ -199,10 +200,10 @@ def placed(result: Polished) -> tuple[np.ndarray, np.ndarray]:
     return s.rotation @ result.datum.rotation.T, result.datum.points(centers(s.rotation, s.translation))
 
 
-def assert_at_truth(result: Polished, problem: Problem, tolerance: float) -> None:
+def assert_at_truth(result: Polished, problem: Problem) -> None:
     rotation, position = placed(result)
-    assert np.abs(position - true_centers(problem)).max() < tolerance
-    assert np.abs(rotation - true_cam_from_world(problem)).max() < tolerance
+    np.testing.assert_allclose(position, true_centers(problem), rtol=0.0, atol=1e-11)
+    np.testing.assert_allclose(rotation, true_cam_from_world(problem), rtol=0.0, atol=1e-12)
 
 
 @pytest.fixture(scope="module")
@@ -249,11 +250,11 @@ def controls(problem: Problem) -> dict[str, Control]:
 @pytest.mark.parametrize("kind", controls(make_problem("handheld", points=250, parallax=0.2)))
 def test_without_noise_the_world_of_the_control_is_found_exactly(kind: str, exact: Problem) -> None:
     result = solve(exact, controls(exact)[kind])
-    assert_at_truth(result, exact, 1e-5)
+    assert_at_truth(result, exact)
     assert result.control is not None
     assert result.datum is not None
-    assert result.datum.scale == pytest.approx(WORLD.scale * unit_of(result, exact), rel=1e-5)
-    assert all(residual.sigmas < 0.01 and not residual.contradicts for residual in result.control.residuals)
+    assert result.datum.scale == pytest.approx(WORLD.scale * unit_of(result, exact), rel=1e-10)
+    assert all(residual.sigmas < 1e-10 and not residual.contradicts for residual in result.control.residuals)
     assert not result.control.unused
     assert result.control.placed
 
@@ -275,50 +276,51 @@ def test_a_distance_alone_gives_the_scale(exact: Problem) -> None:
     length = float(np.linalg.norm(true_centers(exact)[0] - true_centers(exact)[9]))
     result = solve(exact, Control(distances=[KnownDistance(length, SIGMA, (10, 19))]))
     assert result.datum is not None
-    assert result.datum.scale == pytest.approx(WORLD.scale * unit_of(result, exact), rel=1e-6)
+    assert result.datum.scale == pytest.approx(WORLD.scale * unit_of(result, exact), rel=1e-11)
     np.testing.assert_allclose(result.datum.rotation, np.eye(3))
     np.testing.assert_allclose(result.state.translation[0], 0.0, atol=1e-12)
     assert result.control is not None
-    assert result.control.scale_std == pytest.approx(SIGMA / length, rel=0.05)
-    assert 0.3 * SIGMA < result.control.position_std < 1.5 * SIGMA  # relative to the first camera
+    assert result.control.scale_std == pytest.approx(SIGMA / length, rel=0.004)
+    assert 0.8 * SIGMA < result.control.position_std < 1.4 * SIGMA  # relative to the first camera
     assert not result.control.placed
 
 
 def test_noise_of_the_control_shows_in_the_scale_as_foretold() -> None:
-    """Errors of the scale and of the cameras, in their standard deviations, over several draws."""
-    scales, poses = [], []  # over twelve draws 1.01 (root mean square) and 0.89 (per degree of freedom)
-    for seed in range(8):
-        problem = make_problem("handheld", points=250, parallax=0.2, noise_px=0.3, seed=seed)
+    """Errors of the scale and of cameras in their standard deviations; the robust weights err on the safe side."""
+    scales: list[tuple[float, int]] = []
+    poses: dict[int, list[tuple[float, int]]] = {1: [], 5: [], 9: []}
+    for seed in range(24):
+        problem = make_problem("handheld", points=100, parallax=0.2, noise_px=0.3, seed=seed)
         rng = np.random.default_rng([seed, 5])
         known = [known_pose(problem, k, 0.02, noise=0.02 * rng.standard_normal(3)) for k in range(0, 10, 2)]
         result = solve(problem, Control(known))
         assert result.control is not None
         assert result.datum is not None
         rotation, position = placed(result)
-        extent = np.linalg.norm(true_centers(problem)[0] - true_centers(problem), axis=1).max()
-        assert 0.3 * 0.02 / extent < result.control.scale_std < 2 * 0.02 / extent
+        spread = np.linalg.norm(true_centers(problem)[::2] - true_centers(problem)[::2].mean(axis=0))
+        assert 0.95 < result.control.scale_std * spread / 0.02 < 1.2  # the scene adds a little of its own
         mean = 1 / np.mean(result.state.inverse_distance / problem.truth.inverse_distance[result.tracks])
-        scales.append(np.log(result.datum.scale * mean / WORLD.scale) / result.control.scale_std)
-        for k in (1, 5, 9):
+        scales.append(((np.log(result.datum.scale * mean / WORLD.scale) / result.control.scale_std) ** 2, 1))
+        for k, trials in poses.items():
             covariance = result.covariance[k] * np.outer(*2 * [np.repeat([1.0, result.datum.scale], 3)])
             turn = cv2.Rodrigues(true_cam_from_world(problem)[k] @ rotation[k].T)[0][:, 0]
             off = np.append(turn, rotation[k] @ (position[k] - true_centers(problem)[k]))
-            poses.append(off @ np.linalg.solve(covariance, off))
-    assert 0.5 < np.sqrt(np.mean(np.square(scales))) < 1.6
-    assert 0.7 < np.mean(poses) / 6 < 1.5
+            trials.append(normalised(off, covariance))
+    for trials in (scales, *poses.values()):
+        assert_calibrated(trials, low=0.79)
 
 
 def test_the_images_are_straightened_where_the_control_is_better(noisy: Problem) -> None:
     free, known = solve(noisy, None), [known_pose(noisy, k, 1e-4) for k in range(noisy.frames)]
     result = solve(noisy, Control(known))
     _, position = placed(result)
-    assert 3e-5 < np.abs(position - true_centers(noisy)).max() < 4e-4
+    assert 5e-5 < np.abs(position - true_centers(noisy)).max() < 2e-4
     unit = WORLD.scale * unit_of(free, noisy)
     truth = noisy.truth
     before = centers(free.state.rotation, free.state.translation) - centers(truth.rotation, truth.translation)
-    assert unit * np.abs(before).max() > 1e-3
+    assert 1e-3 < unit * np.abs(before).max() < 2e-3
     assert result.control is not None
-    assert 0.02 < np.sqrt(np.mean([r.sigmas**2 for r in result.control.residuals])) < 2.0
+    assert 0.3 < np.sqrt(np.mean([r.sigmas**2 for r in result.control.residuals])) < 1.0
 
 
 def test_poses_with_sigma_zero_stay_as_they_are_given(noisy: Problem) -> None:
@@ -331,7 +333,7 @@ def test_poses_with_sigma_zero_stay_as_they_are_given(noisy: Problem) -> None:
     np.testing.assert_array_equal(result.covariance[held], 0.0)
     assert (result.covariance[[0, 1]].diagonal(axis1=1, axis2=2) > 0).all()
     others = [0, 1, 3, 4, 6, 7, 8]
-    assert 1e-5 < np.abs(position[others] - true_centers(noisy)[others]).max() < 0.01
+    assert 3e-4 < np.abs(position[others] - true_centers(noisy)[others]).max() < 1.4e-3
     assert result.control is not None
     assert result.control.held == ["002.jpg", "005.jpg", "009.jpg"]
 
@@ -361,7 +363,7 @@ def test_what_contradicts_the_images_is_flagged_and_does_not_drag_the_rest(what:
     }  # fmt: skip
     assert wrong_ones == {expected[what]}
     _, position = placed(result)
-    assert np.abs(position - true_centers(noisy)).max() < 0.012
+    assert 3e-4 < np.abs(position - true_centers(noisy)).max() < 0.003
 
 
 # --- what is left open ------------------------------------------------------------------------------------------
@@ -411,7 +413,7 @@ def test_control_of_frames_without_a_pose_cannot_be_used(exact: Problem) -> None
 def test_a_line_and_a_rotation_are_enough() -> None:
     problem = make_problem("truck", points=150, parallax=0.2)
     control = Control([known_pose(problem, 0, SIGMA), known_pose(problem, 9, SIGMA, 0.1)])
-    assert_at_truth(solve(problem, control), problem, 1e-5)
+    assert_at_truth(solve(problem, control), problem)
 
 
 def test_a_camera_that_only_turns_has_nothing_for_control() -> None:
@@ -435,7 +437,7 @@ def test_a_long_shot_is_held_where_it_is_known() -> None:
     _, position = placed(result)
     off = np.abs(position - true_centers(problem)).max(axis=1)
     assert off[[3, 10]].max() < 1e-10
-    assert 1e-5 < off.max() < 0.01
+    assert 2e-4 < off.max() < 1e-3
     assert result.control is not None
     names = [residual.name for residual in result.control.residuals]
     # Two, half of the limit, are solved because they are known, 005 as well without control.
@@ -541,14 +543,14 @@ def test_a_rendered_shot_comes_out_in_the_world_of_its_control(tmp_path: Path) -
     assert result.metric
     assert len(result.registered) == 12
     off = np.linalg.norm(result.camera_centers() - true, axis=1)
-    assert 1e-5 < np.median(off) < 0.003
+    assert 3e-4 < np.median(off) < 0.0016
     for frame, pose in zip(result.frames, poses, strict=True):
         assert frame.cam_from_world is not None
-        assert np.degrees((frame.cam_from_world.rotation * pose.rotation.inverse()).angle()) < 0.5
+        assert np.degrees((frame.cam_from_world.rotation * pose.rotation.inverse()).angle()) < 0.4
     assert result.control is not None
     assert [residual.name for residual in result.control.residuals] == [f"position of {k:06d}" for k in (0, 4, 8, 11)]
     assert any(note.startswith("Control: 4 items used") for note in result.notes)
-    assert 1e-4 < result.control.scale_std < 0.02
+    assert 0.0014 < result.control.scale_std < 0.0055
 
 
 @pytest.mark.parametrize("kind", ["three positions", "one distance"])

@@ -74,7 +74,7 @@ def test_displacement_of_a_rotation():
 def test_a_tripod_shot_is_static(noise_px):
     motion = classified(shot("static", noise_px=noise_px))
     assert motion.kind is ShotKind.STATIC
-    assert motion.displacement_px < 5 * noise_px
+    assert 1.0 * noise_px < motion.displacement_px < 3.5 * noise_px
 
 
 @pytest.mark.parametrize("noise_px", [0.05, 0.3])
@@ -83,7 +83,8 @@ def test_a_pan_on_a_tripod_is_a_rotation(noise_px):
     motion = classified(problem)
     assert motion.kind is ShotKind.ROTATION
     assert motion.displacement_px == pytest.approx(problem.focal * np.radians(12), rel=0.15)
-    assert angles_between(motion.rotation_only.rotation, problem.truth.rotation).max() < 2e-3 * noise_px / 0.3
+    error = angles_between(motion.rotation_only.rotation, problem.truth.rotation).max()
+    assert 6e-4 * noise_px < error < 3e-3 * noise_px
     assert not motion.rotation_only.translation.any()
 
 
@@ -309,7 +310,7 @@ def test_the_polish_says_what_carries_each_camera():
     assert {c.prior_share for c in result.observability} == {0.0}
     angle = np.degrees(np.median(triangulation_angles(problem.truth, problem.observations)))
     for camera in result.observability:
-        assert camera.triangulation_angle_deg == pytest.approx(angle, rel=0.1)
+        assert camera.triangulation_angle_deg == pytest.approx(angle, rel=0.01)
     slides = np.array([c.pixel_slide for c in result.observability])
     assert slides[0] == 0.0
     assert 0.003 < slides[1:].min() <= slides[1:].max() < 0.05

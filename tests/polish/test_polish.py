@@ -46,11 +46,11 @@ def test_the_truth_is_found_from_a_damaged_map(motion, damage):
         bearing=problem.truth.bearing[result.tracks],
         inverse_distance=problem.truth.inverse_distance[result.tracks],
     ))  # fmt: skip
-    assert angles_between(state.rotation, problem_truth.rotation).max() < 3e-3
+    assert angles_between(state.rotation, problem_truth.rotation).max() < 6e-4
     path = np.linalg.norm(problem_truth.translation, axis=1).max()
     error = np.linalg.norm(state.translation - problem_truth.translation, axis=1).max()
-    assert 1e-5 * path < error < 0.1 * path
-    assert 0.05 < result.sigma < 0.15
+    assert 1e-3 * path < error < 0.012 * path
+    assert 0.08 < result.sigma < 0.1
     assert len(result.tracks) > 0.9 * len(start.bearing)
 
 
@@ -73,8 +73,10 @@ def test_a_long_shot_registers_the_frames_between_on_the_polished_points():
     result = polish(mapped_images(problem, problem.truth), points, np.array([problem.focal]), options)
     assert result.frames == list(range(12))
     assert result.covariance.shape == (12, 6, 6)
-    assert angles_between(result.state.rotation, problem.truth.rotation).max() < 1e-3
-    assert np.median(result.errors) == pytest.approx(0.118, rel=0.2)
+    assert angles_between(result.state.rotation, problem.truth.rotation).max() < 7e-4
+    assert (
+        0.095 < np.median(result.errors) < 0.118
+    )  # pixels: the median of two Gaussian errors, of which some are fitted
 
 
 def test_the_tracks_outside_the_core_follow_the_cameras_in_whatever_unit():
@@ -91,8 +93,8 @@ def test_the_tracks_outside_the_core_follow_the_cameras_in_whatever_unit():
         inverse_distance=unit * truth.inverse_distance[core],
     )
     state = with_all_points(solved, solved, seen, core)
-    np.testing.assert_allclose(state.bearing, truth.bearing, atol=1e-6)
-    np.testing.assert_allclose(state.inverse_distance, unit * truth.inverse_distance, rtol=1e-3)
+    np.testing.assert_allclose(state.bearing, truth.bearing, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(state.inverse_distance, unit * truth.inverse_distance, rtol=1e-9)
     np.testing.assert_array_equal(state.translation, solved.translation)
 
 
@@ -107,8 +109,8 @@ def test_a_solution_under_a_wide_kernel_is_solved_again():
     _, best = converge_cameras(problem.truth, seen, options)
     _, found = converge_cameras(bent(problem.truth), seen, options)
     costs = [BundleAdjustment(b.state, seen, options.polish, ErrorModel(0.05)).cost() for b in (best, found)]
-    assert costs[1] == pytest.approx(costs[0], rel=0.01)
-    assert found.sigma == pytest.approx(0.05, rel=0.3)
+    assert costs[1] == pytest.approx(costs[0], rel=1e-4)
+    assert found.sigma == pytest.approx(0.048, rel=0.05)
 
 
 def with_dark_frames(images, dark, kept=0):
@@ -163,8 +165,8 @@ def test_a_weak_first_camera_is_the_world_but_does_not_spoil_the_others():
     relative = result.state.rotation @ result.state.rotation[7].T
     truth = problem.truth.rotation @ problem.truth.rotation[7].T
     errors = angles_between(relative, truth)
-    assert errors[1:].max() < 1e-3
-    assert 1e-6 < errors[0] < 1e-2
+    assert 5e-5 < errors[1:].max() < 4e-4
+    assert 7e-5 < errors[0] < 6e-4
     assert np.isfinite(result.covariance).all()
 
 
