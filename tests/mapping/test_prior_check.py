@@ -33,7 +33,7 @@ def test_maps_of_nothing_disagree_and_the_number_is_named():
     reason = inconsistency(keyframes(shuffled=range(5))[1])
     assert reason.startswith("the order of its depths correlates from keyframe to keyframe by ")
     assert reason.endswith(", at least 0.25 expected")
-    assert abs(float(reason.split()[-5].rstrip(","))) < 0.25
+    assert abs(float(reason.split()[-5].rstrip(","))) < 0.05
 
 
 def test_one_bad_map_is_an_accident():

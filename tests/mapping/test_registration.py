@@ -7,6 +7,7 @@ from factorsfm.graph.factors import camera_from_pose, image_reprojection_factor,
 from factorsfm.mapping.registration import _KERNEL, _align, register_image
 from factorsfm.priors.affine import fit_affine
 from factorsfm.priors.image_depth import ImageDepth
+from tests.calibration import assert_calibrated, normalised
 from tests.estimation_problems import angles_between, make_problem, rotation_matrices
 
 SETTINGS = {"focal": 600.0, "sigma": 0.25, "inlier_px": 3.0}
@@ -44,9 +45,9 @@ def assert_pose(result, *, angle_rad, distance):
 def test_exact_observations_give_the_exact_pose(start, planar):
     points, observed = view(planar=planar)
     result = register_image(points, observed, *start(), **SETTINGS)
-    assert_pose(result, angle_rad=1e-6, distance=1e-5)
+    assert_pose(result, angle_rad=1e-14, distance=1e-14)
     assert result.inliers.all()
-    assert result.error == pytest.approx(0.0, abs=1e-3)
+    assert result.error == pytest.approx(0.0, abs=1e-12)
     assert result.affine is None
 
 
@@ -59,7 +60,7 @@ def test_outliers_are_found(start, share):
     observed[wild] += np.random.default_rng(1).choice([-1, 1], (wild.sum(), 2)) * [0.1, 0.05]  # 60 and 30 pixels
     result = register_image(points, observed, *start(), **SETTINGS)
     np.testing.assert_array_equal(result.inliers, ~wild)
-    assert_pose(result, angle_rad=5e-4, distance=3e-3)
+    assert_pose(result, angle_rad=3e-4, distance=7e-4)
     assert result.error == pytest.approx(0.25 * 1.18, rel=0.15)  # median of a Rayleigh distribution
     assert result.threshold == 3.0
 
@@ -97,15 +98,16 @@ def test_few_points_near_the_start(count):
     points, observed = view(count)
     result = register_image(points, observed, *near(), **SETTINGS)
     assert result.inliers.shape == (count,)
-    if result.inliers.all() and count > 3:  # three points leave four solutions
-        assert_pose(result, angle_rad=1e-4, distance=1e-3)
-    assert result.error < 3.0
+    assert result.inliers.all()
+    assert result.error < 1e-12
+    if count > 3:  # three points leave four solutions
+        assert_pose(result, angle_rad=1e-14, distance=1e-14)
 
 
 def test_nonsense_finds_few_inliers():
     points, observed = view(100)
     shuffled = np.random.default_rng(0).permutation(observed)
-    assert register_image(points, shuffled, *near(), **SETTINGS).inliers.sum() < 20
+    assert register_image(points, shuffled, *near(), **SETTINGS).inliers.sum() < 8
 
 
 # --- the optimum ------------------------------------------------------------------------------------------------
@@ -151,7 +153,7 @@ def test_alignment_under_more_noise_than_it_is_told_stays_far_below_the_noise():
     rotation, translation = _align(points, observed, *near(), SETTINGS["focal"], 0.25)[:2]
     expected = gtsam_optimum(points, observed, 0.25)
     assert angles_between(rotation[None], expected[0][None])[0] < 2e-5
-    assert angles_between(rotation[None], ROTATION[None])[0] > 1e-4
+    assert 4e-4 < angles_between(rotation[None], ROTATION[None])[0] < 1.5e-3
     assert cost(expected[2], rotation, translation) == pytest.approx(cost(expected[2], *expected[:2]), rel=1e-5)
 
 
@@ -161,20 +163,24 @@ def test_alignment_starts_with_points_behind_the_camera():
     q = points @ behind[0].T + behind[1]
     assert 0.05 < (q[:, 2] < 0).mean() < 0.5
     rotation, translation = _align(points, observed, *behind, SETTINGS["focal"], 25.0)[:2]
-    assert angles_between(rotation[None], ROTATION[None])[0] < 1e-5
-    assert np.linalg.norm(translation - TRANSLATION) < 1e-4
+    assert angles_between(rotation[None], ROTATION[None])[0] < 1e-14
+    assert np.linalg.norm(translation - TRANSLATION) < 1e-14
 
 
 def test_the_covariance_is_that_of_the_errors():
-    """In GTSAM's pose convention; the Cauchy weights make it about a quarter too large, on the safe side."""
-    normalised = []
-    for seed in range(60):
+    """In GTSAM's pose convention.
+
+    The kernel's unit is the median length of the errors, 1.18 standard deviations: with Gaussian errors it then says
+    1 / 0.61 times the variance that the poses have, on the safe side.
+    """
+    trials = []
+    for seed in range(200):
         points, observed = view(120, noise_px=0.25, seed=seed)
         result = register_image(points, observed, *near(), **SETTINGS)
         truth = pose_from_camera(ROTATION, TRANSLATION)
         error = pose_from_camera(result.rotation, result.translation).localCoordinates(truth)
-        normalised.append(error @ np.linalg.solve(result.covariance, error) / 6)
-    assert 0.6 < np.mean(normalised) < 1.0
+        trials.append(normalised(error, result.covariance))
+    assert_calibrated(trials, 0.61, 0.61)
 
 
 # --- scale and shift --------------------------------------------------------------------------------------------
@@ -184,9 +190,9 @@ def test_the_covariance_is_that_of_the_errors():
 def test_fit_affine_recovers_scale_and_shift(scale, shift):
     inverse = np.random.default_rng(0).uniform(0.3, 2, 200)
     fitted = fit_affine(inverse, scale * inverse + shift)
-    assert fitted[0] == pytest.approx(scale, rel=1e-4)
-    assert fitted[1] == pytest.approx(shift, abs=1e-4)
-    assert fitted[2] < 1e-3
+    assert fitted[0] == pytest.approx(scale, rel=1e-12)
+    assert fitted[1] == pytest.approx(shift, abs=1e-12)
+    assert fitted[2] <= 1e-6  # the least spread that it says
 
 
 def test_fit_affine_with_noise_and_outliers():
@@ -195,8 +201,8 @@ def test_fit_affine_with_noise_and_outliers():
     measured = 1.3 * inverse + 0.2 + 0.05 * rng.standard_normal(400)
     measured[:80] = rng.uniform(0, 5, 80)
     scale, shift, spread = fit_affine(inverse, measured)
-    assert scale == pytest.approx(1.3, abs=0.03)
-    assert shift == pytest.approx(0.2, abs=0.03)
+    assert scale == pytest.approx(1.3, abs=0.005)
+    assert shift == pytest.approx(0.2, abs=0.005)
     assert 0.04 < spread < 0.08
 
 
@@ -210,16 +216,16 @@ def test_fit_affine_without_a_free_shift():
     inverse = np.random.default_rng(0).uniform(0.3, 2, 200)
     noisy = 1.5 * inverse + 0.1 * np.random.default_rng(1).standard_normal(200)
     scale, shift, _ = fit_affine(inverse, noisy, free_shift=False)
-    assert scale == pytest.approx(1.5, rel=0.03)
-    assert abs(shift) < 0.04
+    assert scale == pytest.approx(1.5, rel=0.007)
+    assert 1e-4 < abs(shift) < 0.005
 
 
 def test_fit_affine_of_a_plane_parallel_to_the_image():
     """All points at one depth tell the scale or the shift, not both: the shift stays where its prior is."""
     measured = 2.0 + 0.01 * np.random.default_rng(0).standard_normal(50)
     scale, shift, _ = fit_affine(np.ones(50), measured)
-    assert scale + shift == pytest.approx(2.0, abs=0.01)
-    assert abs(shift) < 0.6
+    assert scale + shift == pytest.approx(2.0, abs=0.003)
+    assert abs(shift) < 1e-4
 
 
 # --- with depth -------------------------------------------------------------------------------------------------
@@ -234,7 +240,7 @@ def depths_of(points, *, scale=1.3, shift=0.2, noise=0.0):
 def test_inverse_domain_recovers_pose_and_affine():
     points, observed = view()
     result = register_image(points, observed, *near(), depth=depths_of(points), **SETTINGS)
-    assert_pose(result, angle_rad=1e-5, distance=1e-4)
+    assert_pose(result, angle_rad=1e-14, distance=1e-14)
     assert result.affine == pytest.approx((1.3, 0.2), rel=1e-2)
 
 
@@ -245,7 +251,7 @@ def test_the_papers_domain_recovers_pose_and_affine():
     gamma, beta = 0.7, 0.3
     depth = ImageDepth(gamma / (z - beta), np.ones(len(z)), unit=1.0)
     result = register_image(points, observed, *near(), depth=depth, domain="depth", depth_weight=6.0, **SETTINGS)
-    assert_pose(result, angle_rad=1e-5, distance=1e-4)
+    assert_pose(result, angle_rad=1e-14, distance=1e-14)
     assert result.affine == pytest.approx((gamma, beta), rel=1e-2)
 
 
@@ -256,8 +262,8 @@ def test_a_poor_prior_does_little_harm(domain):
     depth = depths_of(points, shift=0.0, noise=0.05)
     result = register_image(points, observed, *near(), depth=depth, domain=domain, depth_weight=6.0, **SETTINGS)
     assert result.affine is not None
-    assert angles_between(result.rotation[None], alone.rotation[None])[0] < 2e-3
-    assert np.linalg.norm(result.translation - alone.translation) < 0.02
+    assert angles_between(result.rotation[None], alone.rotation[None])[0] < 1e-4
+    assert np.linalg.norm(result.translation - alone.translation) < 4e-4
     assert result.inliers.mean() > 0.97
 
 
@@ -293,8 +299,8 @@ def test_every_frame_of_a_shot_from_the_one_before(motion):
         result = register_image(
             problem.points[ids], xy, rotation, translation, focal=problem.focal, sigma=0.25, inlier_px=3.0
         )
-        assert angles_between(result.rotation[None], problem.truth.rotation[frame][None])[0] < 1e-6
-        assert np.linalg.norm(result.translation - problem.truth.translation[frame]) < 1e-6
+        assert angles_between(result.rotation[None], problem.truth.rotation[frame][None])[0] < 1e-13
+        assert np.linalg.norm(result.translation - problem.truth.translation[frame]) < 1e-13
         rotation, translation = result.rotation, result.translation
 
 
@@ -305,7 +311,7 @@ def test_half_of_the_observations_may_be_wrong(seed):
     wrong = rng.permutation(200)[:100]
     observed[wrong] = rng.uniform(-0.5, 0.5, (100, 2))
     result = register_image(points, observed, *near(), **SETTINGS)
-    assert_pose(result, angle_rad=1e-3, distance=0.01)
+    assert_pose(result, angle_rad=1e-3, distance=0.005)
     assert 95 <= result.inliers.sum() <= 110
 
 
@@ -315,5 +321,5 @@ def test_something_that_moves_as_one_does_not_take_the_camera_along(seed):
     mover = np.random.default_rng(seed).permutation(200)[:60]
     observed[mover, 0] += 15.0 / SETTINGS["focal"]
     result = register_image(points, observed, *near(), **SETTINGS)
-    assert_pose(result, angle_rad=1e-3, distance=0.01)
+    assert_pose(result, angle_rad=3e-4, distance=0.0015)
     assert not result.inliers[mover].any()
