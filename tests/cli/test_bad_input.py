@@ -265,7 +265,7 @@ def test_a_black_stretch_costs_its_own_frames_only(first: int, last: int) -> Non
     assert "contrast 0.00 of 0.20" in result.frames[first].message
     del result.frames[first:last]
     assert len(result.registered) == FRAMES
-    assert 1e-5 < np.median(errors_of(result, shot).ate) < 0.02
+    assert 0.0008 < np.median(errors_of(result, shot).ate) < 0.005
 
 
 def test_after_a_cut_nothing_is_invented() -> None:
@@ -298,7 +298,7 @@ def test_a_static_camera_gets_no_motion(make: Callable[[], Images], with_prior: 
     assert result.parallax == 0.0
     np.testing.assert_array_equal(result.camera_centers(), np.zeros((8, 3)))
     turns = [np.degrees(frame.cam_from_world.rotation.angle()) for frame in result.frames]
-    assert max(turns) < 0.005
+    assert max(turns) < 0.002
     (note,) = result.notes
     assert note.startswith("The camera is static")
     assert ("from the prior alone" in note) == with_prior
@@ -325,7 +325,7 @@ def test_a_rotating_camera_gets_its_rotation_and_no_translation(preset: str) -> 
     truth = np.array([pose.inverse().rotation.matrix() for pose in shot.cam_from_world])
     errors = turn_errors(result, truth)
     assert len(errors) == FRAMES
-    assert 1e-5 < errors.max() < 0.05  # of 12 degrees
+    assert 0.003 < errors.max() < 0.02  # of 12 degrees
 
 
 def test_a_camera_that_only_turns_takes_no_control() -> None:
@@ -342,7 +342,7 @@ def test_a_tripod_pan_of_the_development_data(shared_data: Path) -> None:
     assert_rotation(result)
     errors = turn_errors(result, shot.rotations[:36:3])
     assert len(errors) == 12
-    assert 1e-4 < errors.max() < 0.05
+    assert 6e-4 < errors.max() < 0.005
 
 
 # --- priors -------------------------------------------------------------------------------------------------------
@@ -389,7 +389,7 @@ def test_a_few_maps_are_enough(tmp_path: Path) -> None:
     assert len(result.registered) == FRAMES
     assert not any("took no part" in note for note in result.notes)
     assert result.frames[0].prior is not None
-    assert 1e-5 < np.median(errors_of(result, rendered("dolly")).ate) < 0.02
+    assert 0.0008 < np.median(errors_of(result, rendered("dolly")).ate) < 0.005
 
 
 @pytest.mark.parametrize("value", [np.nan, 0.0, -1.0, np.inf])
@@ -399,13 +399,13 @@ def test_maps_without_a_valid_value_are_as_good_as_none(preset: str, value: floa
     result = reconstruct(rendered("dolly").images, depth, preset=preset)
     assert len(result.registered) == FRAMES
     assert "The depth prior took no part: no frame that needed it has a usable depth map." in result.notes
-    assert 1e-5 < np.median(errors_of(result, rendered("dolly")).ate) < 0.02
+    assert 0.0008 < np.median(errors_of(result, rendered("dolly")).ate) < 0.005
 
 
 def test_a_flat_prior_does_no_harm() -> None:
     result = reconstruct(rendered("dolly").images, Maps([np.ones((90, 160), np.float32)] * FRAMES))
     assert len(result.registered) == FRAMES
-    assert 1e-5 < np.median(errors_of(result, rendered("dolly")).ate) < 0.02
+    assert 0.0008 < np.median(errors_of(result, rendered("dolly")).ate) < 0.005
 
 
 def failing_network(path: Path) -> Path:

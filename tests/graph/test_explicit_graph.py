@@ -82,16 +82,17 @@ def test_the_result_is_its_minimum(motion: Motion, guided: bool) -> None:
     before, after = graph.error(values), graph.error(found)
     assert 0.99 * before < after <= before
     unit = mean_inverse_distance(found, len(r.points)) / mean_inverse_distance(values, len(r.points))
-    assert unit == pytest.approx(1.0, abs=0.01)
+    assert unit == pytest.approx(1.0, abs=0.005)
     deviations = [np.sqrt(np.diag(frame.covariance)) for frame in r.frames]
     for step, std in zip(moved(values, found, unit)[1:], deviations[1:], strict=True):
         assert (np.abs(step) < std).all()
-    np.testing.assert_allclose(moved(values, found)[0], 0.0, atol=1e-5)
-    for i, frame in enumerate(r.frames):
-        if frame.prior is not None:
-            scale, shift = affine_of_native(found.atCal3_S2(A(i)))
-            assert unit * scale == pytest.approx(frame.prior.scale, abs=frame.prior.scale_std)
-            assert shift == pytest.approx(frame.prior.shift, abs=frame.prior.shift_std)
+    np.testing.assert_allclose(moved(values, found)[0], 0.0, atol=1e-12)
+    priors = {i: frame.prior for i, frame in enumerate(r.frames) if frame.prior is not None}
+    assert bool(priors) == guided
+    for i, prior in priors.items():
+        scale, shift = affine_of_native(found.atCal3_S2(A(i)))
+        assert unit * scale == pytest.approx(prior.scale, abs=0.3 * prior.scale_std)
+        assert shift == pytest.approx(prior.shift, abs=0.3 * prior.shift_std)
 
 
 def test_it_finds_back_to_the_minimum() -> None:
@@ -112,10 +113,10 @@ def test_a_measured_length_sets_the_scale() -> None:
     noise = gtsam.noiseModel.Isotropic.Sigma(1, 1e-3 * travel)
     graph.add(gtsam.RangeFactorPose3(X(0), X(FRAMES - 1), 2.0 * travel, noise))
     found = optimized(graph, values)
-    assert np.linalg.norm(found.atPose3(X(FRAMES - 1)).translation()) == pytest.approx(2.0 * travel, rel=5e-3)
+    assert np.linalg.norm(found.atPose3(X(FRAMES - 1)).translation()) == pytest.approx(2.0 * travel, rel=2e-5)
     points = np.array([found.atPoint3(L(j)) for j in range(len(r.points))])
     ratio = np.linalg.norm(points, axis=1) / np.linalg.norm(r.points, axis=1)
-    assert np.median(ratio) == pytest.approx(2.0, rel=0.02)
+    assert np.median(ratio) == pytest.approx(2.0, rel=0.001)
 
 
 @pytest.mark.parametrize(("motion", "kind"), [("rotation", ShotKind.ROTATION), ("static", ShotKind.STATIC)])
@@ -124,8 +125,8 @@ def test_a_camera_that_only_turns_stays_where_it_is(motion: Motion, kind: ShotKi
     assert r.kind is kind
     graph, values = factor_graph(r)
     found = optimized(graph, values)
-    np.testing.assert_allclose(moved(values, found)[:, 3:], 0.0, atol=1e-5)
-    assert graph.error(found) > 0.97 * graph.error(values) - 1e-6
+    np.testing.assert_allclose(moved(values, found)[:, 3:], 0.0, atol=1e-6)
+    assert graph.error(found) == pytest.approx(graph.error(values), rel=0.03, abs=1e-15)
 
 
 def test_distortion_and_frames_without_a_pose_are_taken_into_account() -> None:
@@ -134,9 +135,9 @@ def test_distortion_and_frames_without_a_pose_are_taken_into_account() -> None:
     graph, values = factor_graph(r)
     projections = factors_of(graph, gtsam.GenericProjectionFactorCal3_S2)
     assert len(projections) == len(r.registered) * len(r.points) < len(r.observation_xy)
-    assert max(np.linalg.norm(factor.unwhitenedError(values)) for factor in projections) < 1e-6
+    assert max(np.linalg.norm(factor.unwhitenedError(values)) for factor in projections) < 2e-9
     assert not values.exists(X(3))
     assert values.exists(A(4))
     straight = replace(r, camera=pycolmap.Camera(model="PINHOLE", width=640, height=480, params=r.camera.params[:4]))
     projections = factors_of(factor_graph(straight)[0], gtsam.GenericProjectionFactorCal3_S2)
-    assert max(np.linalg.norm(factor.unwhitenedError(values)) for factor in projections) > 0.1
+    assert max(np.linalg.norm(factor.unwhitenedError(values)) for factor in projections) > 0.3

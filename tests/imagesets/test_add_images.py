@@ -82,7 +82,7 @@ def assert_consistent(result: Reconstruction) -> None:
         q = result.frames[row].cam_from_world * result.points[result.observation_point[mine]]
         off = pixels_from_normalized(result.camera, q[:, :2] / q[:, 2:]) - result.observation_xy[mine]
         np.testing.assert_allclose(np.linalg.norm(off, axis=1), result.observation_error[mine], atol=1e-9)
-    assert np.median(result.observation_error) < 0.5
+    assert 0.02 < np.median(result.observation_error) < 0.12
 
 
 def test_known_cameras_stay_as_they_are_and_new_ones_are_where_they_were(material: Set, added: Reconstruction) -> None:
@@ -95,8 +95,8 @@ def test_known_cameras_stay_as_they_are_and_new_ones_are_where_they_were(materia
         np.testing.assert_array_equal(after.cam_from_world.matrix(), before.cam_from_world.matrix())
     assert all(frame.status is FrameStatus.REGISTERED for frame in added.frames)
     off = material.errors(added)
-    assert 1e-5 < off[6:].max() < 2.0 * off[:6].max()
-    assert off.max() < 0.005
+    assert 5e-5 < off[6:].max() < 2.0 * off[:6].max()
+    assert off.max() < 5e-4
     assert_consistent(added)
     assert len(added.points) > 1.2 * len(known.points)
     seen_anew = np.unique(added.observation_point[added.observation_frame >= 6])
@@ -105,9 +105,9 @@ def test_known_cameras_stay_as_they_are_and_new_ones_are_where_they_were(materia
     np.testing.assert_array_equal(added.points[unseen], known.points[unseen])
     for frame in added.frames[6:]:
         assert frame.covariance is not None
-        assert 0 < np.sqrt(np.trace(frame.covariance[3:, 3:])) < 0.01
+        assert 1.5e-5 < np.sqrt(np.trace(frame.covariance[3:, 3:])) < 7e-5
         assert frame.observability is not None
-        assert frame.inliers > 50
+        assert frame.inliers > 400
     assert "3 of 3 further images were registered on the result." in added.notes
 
 
@@ -123,9 +123,9 @@ def test_refined_cameras_stay_in_their_coordinates_as_a_whole(material: Set) -> 
     before = pose_arrays([frame.cam_from_world for frame in known.frames])
     after = pose_arrays([frame.cam_from_world for frame in refined.frames[:6]])
     similarity = align(*after, *before)
-    assert similarity.scale == pytest.approx(1.0, abs=1e-6)
-    np.testing.assert_allclose(similarity.rotation, np.eye(3), atol=1e-6)
-    assert 1e-7 < np.abs(after[1] - before[1]).max() < 0.005
+    assert similarity.scale == pytest.approx(1.0, abs=1e-12)
+    np.testing.assert_allclose(similarity.rotation, np.eye(3), atol=1e-12)
+    assert 1e-5 < np.abs(after[1] - before[1]).max() < 1e-4
     assert 2e-5 < np.median(material.errors(refined)) < 5e-4
     assert_consistent(refined)
 
@@ -146,7 +146,7 @@ def test_a_result_grows_more_than_once_through_its_files(material: Set, tmp_path
     assert summary["options"]["added"] == [
         {"source": str(tmp_path / "n1"), "first": 6}, {"source": str(tmp_path / "n4"), "first": 7}
     ]  # fmt: skip
-    assert material.errors(result).max() < 0.005
+    assert 5e-5 < material.errors(result).max() < 7e-4
     export(result, tmp_path / "splats", format="nerfstudio")
     assert len(list((tmp_path / "splats" / "images").iterdir())) == 8
 
@@ -182,7 +182,7 @@ def test_images_of_the_own_source_keep_their_index(material: Set) -> None:
     result = add_images(part, folder)
     assert [frame.index for frame in result.registered] == list(range(9))
     assert "added" not in result.options or result.options["added"] == []
-    assert material.errors(result).max() < 0.005
+    assert 5e-5 < material.errors(result).max() < 7e-4
 
 
 def test_photographs_are_added_to_a_shot(tmp_path: Path) -> None:
@@ -198,7 +198,7 @@ def test_photographs_are_added_to_a_shot(tmp_path: Path) -> None:
     assert [frame.index for frame in result.frames[12:]] == [14, 16]
     poses = [*shot.cam_from_world, stills.cam_from_world[2], stills.cam_from_world[4]]
     errors = trajectory_errors(*pose_arrays([f.cam_from_world for f in result.frames]), *pose_arrays(poses))
-    assert 1e-5 < errors.ate.max() < 0.02  # of distances of up to 0.9
+    assert 3e-4 < errors.ate.max() < 0.0025  # of distances of up to 0.9
     assert result.parallax == pytest.approx(0.2, rel=0.15)
 
 

@@ -59,7 +59,7 @@ def test_every_frame_has_a_causal_pose(run):
         np.degrees((u.cam_from_world.rotation * true.rotation.inverse()).angle())
         for u, true in zip(updates, shot.cam_from_world, strict=True)
     ]
-    assert max(turns) < 0.5
+    assert 0.01 < max(turns) < 0.1
     z = [u.cam_from_world.inverse().translation[2] for u in updates]
     assert np.all(np.diff(z) > 0)  # the dolly goes forward
 
@@ -77,8 +77,8 @@ def test_new_points_are_those_that_the_map_gained():
 def test_the_polished_path_is_the_true_one(run):
     _, result = run
     error = errors_of(result, rendered("dolly"))
-    assert 1e-5 < np.median(error.ate) < 0.01  # share of the path's length
-    assert 1e-5 < np.median(error.r_rpe) < 0.03  # degrees
+    assert 0.0008 < np.median(error.ate) < 0.005  # share of the path's length
+    assert 0.002 < np.median(error.r_rpe) < 0.012  # degrees
     assert result.kind is ShotKind.GENERAL
     assert result.notes == []
     assert 0.03 < result.parallax < 0.07  # 0.05 of the median depth of all pixels
@@ -175,7 +175,7 @@ def test_finish_without_enough_frames(pushed):
 
 
 def test_an_unknown_lens_is_guessed_and_estimated():
-    s = stream(camera=None)
+    s = stream(camera=None, options=replace(QUICK, shutter="global"))
     for image in rendered("dolly").images:
         s.push(image)
     result = s.finish()
@@ -265,7 +265,7 @@ def test_a_map_that_the_following_frames_do_not_join_is_given_up(foreign):
     assert [frame.status is FrameStatus.REGISTERED for frame in result.frames] == [False] * foreign + [True] * 14
     assert "none of those that followed joined" in result.frames[0].message
     own = replace(result, frames=result.frames[foreign:])
-    assert np.median(errors_of(own, shot).ate) < 0.01
+    assert 0.0007 < np.median(errors_of(own, shot).ate) < 0.005
 
 
 @pytest.mark.parametrize(
@@ -288,7 +288,7 @@ def test_without_a_prior_that_is_none_the_stream_goes_on(mirrored, reason, caplo
     result = s.finish()
     assert [note for note in result.notes if reason in note]
     assert len(result.registered) == 30
-    assert np.median(errors_of(result, shot).ate) < 0.002
+    assert 0.0002 < np.median(errors_of(result, shot).ate) < 0.0013
 
 
 def test_a_prior_that_is_left_out_stays_so_in_a_snapshot(tmp_path):
@@ -348,7 +348,7 @@ def test_masked_regions_hold_no_point():
     result = s.finish()
     assert len(result.registered) == FRAMES
     assert result.observation_xy[:, 0].min() > 159
-    assert np.median(errors_of(result, shot).ate) < 0.02
+    assert 0.0007 < np.median(errors_of(result, shot).ate) < 0.0045
 
 
 def test_no_pixels_are_kept(run):
@@ -382,6 +382,6 @@ def test_a_graph_whose_process_is_killed_comes_back(run, caplog):
     assert 1 <= len(caplog.messages) <= 2
     assert all("rolled back: the process of the graph was killed by SIGKILL" in m for m in caplog.messages)
     assert {u.status for u in updates} == {FrameStatus.REGISTERED}
-    assert np.median(errors_of(result, rendered("dolly")).ate) < 0.01
+    assert 0.0008 < np.median(errors_of(result, rendered("dolly")).ate) < 0.005
     undisturbed = sum(u.keyframe for u in run[0])
     assert undisturbed - len(caplog.messages) <= sum(f.keyframe for f in result.frames) <= undisturbed

@@ -277,7 +277,7 @@ def test_a_track_that_left_the_view_a_while_ago_is_taken_up_again_where_its_patc
     after = tracker.track(shot.images[0])
     _, here, there = np.intersect1d(after.ids, revived, return_indices=True)
     error = np.linalg.norm(after.xy[here] - born.xy[np.searchsorted(born.ids, revived[there])], axis=1)
-    assert np.median(error) < 0.2
+    assert np.median(error) < 0.08
     assert not np.isin(revived, tracker.ended).any()
     assert (np.diff(after.ids) > 0).all()
 

@@ -70,9 +70,9 @@ def test_learned_matches_are_verified_and_kept(shot: RenderedShot, tmp_path: Pat
     assert [(p.first, p.second) for p in second.pairs] == [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
     for pair in second.pairs:
         errors = transfer_errors(shot, second, pair)
-        assert len(errors) > 50
-        assert np.median(np.linalg.norm(errors, axis=1)) < 0.5
-        assert np.abs(np.median(errors, axis=0)).max() < 0.15  # half a pixel would show
+        assert len(errors) > 80
+        assert 0.05 < np.median(np.linalg.norm(errors, axis=1)) < 0.3
+        assert np.abs(np.median(errors, axis=0)).max() < 0.03  # half a pixel would show
     with pycolmap.Database.open(database) as db:
         assert db.num_matches() > db.num_inlier_matches() > 0  # something was wrong, and is gone
 
@@ -151,5 +151,5 @@ def test_the_real_networks_on_a_real_room(shared_data: Path, shared_models: Path
     estimate = pose_arrays([frame.cam_from_world for frame in result.frames])
     errors = trajectory_errors(*estimate, shot.rotations[:24:6], shot.centers[:24:6])
     # Keypoints are whole pixels: about 2 mm at a distance of 2 m for each of some hundred.
-    assert 1e-4 < errors.ate.max() < 0.01
-    assert errors.r_rpe.max() < 1.0  # with SIFT 0.7: the cameras are only a few centimetres apart
+    assert 5e-4 < errors.ate.max() < 0.004
+    assert 0.3 < errors.r_rpe.max() < 1.0  # with SIFT 0.7: the cameras are only a few centimetres apart

@@ -22,11 +22,11 @@ def test_an_affine_motion_is_found() -> None:
     motion = LocalMotion(old, (old @ AFFINE.T + SHIFT).astype(np.float32), SHAPE)
     inside = old[(old > 100).all(axis=1) & (old < [860, 440]).all(axis=1)]
     linear = motion.linear(inside)
-    assert np.abs(linear - AFFINE).max() < 4e-3
+    assert np.abs(linear - AFFINE).max() < 2e-3
     assert np.abs(np.median(linear, axis=0) - AFFINE).max() < 1e-3
     error = motion.at(inside) - (inside @ AFFINE.T + SHIFT - inside)
-    assert np.linalg.norm(error, axis=1).max() < 0.3
-    assert np.median(np.linalg.norm(error, axis=1)) < 0.05
+    assert np.linalg.norm(error, axis=1).max() < 0.12
+    assert np.median(np.linalg.norm(error, axis=1)) < 0.03
 
 
 def test_far_from_all_tracks_the_image_moves_as_a_whole() -> None:
@@ -51,5 +51,5 @@ def test_a_fit_that_a_third_of_the_rows_contradict() -> None:
     true = rng.normal(0, 3, (5, 2))
     effect = cause @ true + rng.normal(0, 0.05, (60, 2))
     effect[::3] += rng.uniform(8, 20, (20, 2))
-    assert np.abs(robust_fit(cause, effect.astype(np.float32)) - true).max() < 0.15
+    assert np.abs(robust_fit(cause, effect.astype(np.float32)) - true).max() < 0.06
     assert not robust_fit(cause[:9], effect[:9].astype(np.float32)).any()  # too few to tell
