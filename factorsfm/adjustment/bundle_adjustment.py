@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 
 from factorsfm.adjustment.columns import Columns
 from factorsfm.adjustment.depth_term import AffinePrior, DepthTerm
-from factorsfm.adjustment.elimination import Block, Elimination, Normal, conditioned, reduced
+from factorsfm.adjustment.elimination import Block, Elimination, Normal, reduced
 from factorsfm.adjustment.marginals import Marginals, tangent_basis
 from factorsfm.adjustment.observations import Observations, PriorObservations
 from factorsfm.adjustment.problem import NOTHING, POSES, CameraTerm, ErrorModel, Free, Known
+from factorsfm.adjustment.semidefinite import conditioned, covariance_of, solution
 from factorsfm.adjustment.state import State
 from factorsfm.adjustment.track_term import TrackTerm
 from factorsfm.support.options import PolishOptions
@@ -36,7 +37,7 @@ _LARGEST_DAMPING = 1e6
 
 
 def _newton_step(state: State, information: Array, gradient: Array) -> Array:
-    return np.asarray(-np.linalg.solve(information, gradient))
+    return -solution(information, gradient)
 
 
 class BundleAdjustment:
@@ -165,7 +166,7 @@ class BundleAdjustment:
         information, gradient = self.condensed()
         seen = information.diagonal() > 1e-200
         step = np.zeros(len(gradient))
-        step[seen] = -np.linalg.solve(information[np.ix_(seen, seen)], gradient[seen])
+        step[seen] = -solution(information[np.ix_(seen, seen)], gradient[seen])
         return np.asarray(step[np.searchsorted(self._free, self.columns.optics.start + self.free_optics)])
 
     def condensed(self) -> tuple[Array, Array]:
@@ -252,7 +253,7 @@ class BundleAdjustment:
         information, _, given_camera = reduced(normal, blocks, 0.0)
         free = self._free
         camera = np.zeros((self.columns.size, self.columns.size))
-        camera[np.ix_(free, free)] = np.linalg.inv(conditioned(information[np.ix_(free, free)]))
+        camera[np.ix_(free, free)] = covariance_of(conditioned(information[np.ix_(free, free)]))
         return Marginals(camera, given_camera, blocks)
 
     def influences(self, columns: Index) -> Array:
@@ -265,7 +266,7 @@ class BundleAdjustment:
         information, _, given_camera = reduced(normal, blocks, 0.0)
         free = self._free
         gain = np.zeros((self.columns.size, len(columns)))
-        gain[free] = np.linalg.inv(conditioned(information[np.ix_(free, free)]))[:, np.searchsorted(free, columns)]
+        gain[free] = covariance_of(conditioned(information[np.ix_(free, free)]))[:, np.searchsorted(free, columns)]
         moved = np.zeros((len(self.state.bearing), len(columns)))
         for t in normal.terms:
             by_camera = np.einsum("cdm,dm->mc", t.by_camera, t.residual)

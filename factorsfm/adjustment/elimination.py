@@ -202,8 +202,3 @@ def _rooted(cross: Array, root: Array) -> Array:
         part[:, 1] = y * d + z * e
         part[:, 2] = z * f
     return half.reshape(len(cross), 3 * n)
-
-
-def conditioned(information: Array) -> Array:
-    """The matrix with a ridge far below any information that matters."""
-    return np.asarray(information + np.diag(1e-12 * np.maximum(information.diagonal(), 1e-300)))

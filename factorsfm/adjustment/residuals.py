@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+_REACH = 2.0  # of the polynomial of a distortion, in normalised coordinates: 63 degrees off the axis
+
 
 # --- definitions ------------------------------------------------------------------------------------------------
 
@@ -74,6 +76,9 @@ def projection_by_pose(q: Array, focal: float) -> tuple[Array, Array]:
 def distort(uv: Array, lens: Array) -> tuple[Array, Array, Array]:
     """``u (1 + k1 r^2 + k2 r^4) + c``: radial distortion as COLMAP's RADIAL model has it, and a principal point.
 
+    Beyond a field of view that no such lens has the displacement stays what it is at its rim: a wrong match that is
+    predicted far outside of the image would say more of the distortion than all others.
+
     Args:
         uv: (n, 2) undistorted normalised image coordinates.
         lens: (4,) k1, k2, and the principal point's displacement in focal lengths; what follows is of no concern here.
@@ -83,11 +88,14 @@ def distort(uv: Array, lens: Array) -> tuple[Array, Array, Array]:
     """
     k1, k2, *center = lens[:4]
     square = np.einsum("ni,ni->n", uv, uv)[:, None]
-    gain = 1.0 + square * (k1 + square * k2)
-    by_uv = np.einsum("ni,nj->nij", uv * (2.0 * k1 + 4.0 * k2 * square), uv)
+    radius = np.sqrt(np.maximum(square, _REACH**2))  # of those beyond
+    outside, square, share = square > _REACH**2, np.minimum(square, _REACH**2), _REACH / radius
+    bend = share * square * (k1 + square * k2)
+    gain = 1.0 + bend
+    by_uv = np.einsum("ni,nj->nij", uv * np.where(outside, -bend / radius**2, 2.0 * k1 + 4.0 * k2 * square), uv)
     by_uv[:, [0, 1], [0, 1]] += gain
     by_lens = np.zeros((len(uv), 2, 4))
-    by_lens[:, :, 0], by_lens[:, :, 1] = uv * square, uv * square**2
+    by_lens[:, :, 0], by_lens[:, :, 1] = uv * share * square, uv * share * square**2
     by_lens[:, [0, 1], [2, 3]] = 1.0
     return uv * gain + center, by_uv, by_lens
 

@@ -15,9 +15,11 @@ from factorsfm.adjustment.state import State
 
 Array = NDArray[np.float64]
 
+_NEAREST = 1e-6  # depth of a homogeneous point in front of the camera
+
 
 class TrackTerm:
-    """Reprojection residuals, in standard deviations.
+    """Reprojection residuals, in standard deviations; points behind a camera keep a large one, and no derivative.
 
     Args:
         state: with the focal lengths and the lens through which the observations were normalised.
@@ -42,8 +44,8 @@ class TrackTerm:
         """(m, 2) residuals, their derivative (m, 2, 3) by the points in the cameras, and these (m, 3)."""
         o, focal = self._observations, self._focal(state)
         q = state.camera_points(o.frame, o.point)
-        behind = q[:, 2] <= 1e-6
-        q[behind, 2] = 1e-6
+        behind = q[:, 2] <= _NEAREST
+        q[behind, 2] = _NEAREST
         residual, by_q = reprojection(q, self._pixels, focal)
         if self._bends:
             uv, by_uv, _ = distort(q[:, :2] / q[:, 2:], state.lens)
@@ -95,12 +97,13 @@ class TrackTerm:
         """(m, 2, c) derivative of the residuals by focal length and lens of each observation, and (m, c) columns."""
         o, sigma = self._observations, self._errors.sigma
         measured = self._pixels - o.swept(state.lens[READOUT])
-        by_focal = (residual + measured / sigma)[:, :, None]  # d r / d log f is the prediction
+        front = (q[:, 2] > _NEAREST)[:, None, None]
+        by_focal = front * (residual + measured / sigma)[:, :, None]  # d r / d log f is the prediction
         focal_columns = self._columns.log_focal.start + self._group[:, None]
         if not self._bends:
             return by_focal, focal_columns
         by_lens = distort(q[:, :2] / q[:, 2:], state.lens)[2]
-        by_lens *= (self._focal(state) / sigma)[:, None, None]
+        by_lens *= front * (self._focal(state) / sigma)[:, None, None]
         by_readout = np.zeros((len(q), 2, 2))
         if o.sweep is not None:
             by_readout = o.sweep.by_readout(state.lens[READOUT]) / sigma

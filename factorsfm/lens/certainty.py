@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.noise import block_inflation, image_cells
 from factorsfm.adjustment.observations import DISTORTION
+from factorsfm.adjustment.semidefinite import squared_deviations
 from factorsfm.adjustment.state import LENS_SIZE
 
 Array = NDArray[np.float64]
@@ -32,7 +33,7 @@ def lens_deviations(
     if guess is not None:
         free = np.isin(adjustment.free_optics, groups + np.arange(LENS_SIZE)[part])
         away = (adjustment.state.lens - guess)[adjustment.free_optics[free] - groups]
-        evidence = min(float(away @ np.linalg.solve(c[np.ix_(free, free)], away)) for c in covariances)
+        evidence = min(squared_deviations(away, c[np.ix_(free, free)]) for c in covariances)
     return std[:-1].max(0), std[-1], evidence
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import ErrorModel, FocalPrior
+from factorsfm.adjustment.semidefinite import squared_deviations
 from factorsfm.adjustment.state import LENS_SIZE, State
 from factorsfm.lens.certainty import lens_covariances
 from factorsfm.lens.estimate import solved_with_lens
@@ -97,7 +98,7 @@ def find_zoom(known: BundleAdjustment, guess: Lens, times: Array, options: Polis
     covariances = lens_covariances(best)
     std = float(np.sqrt(max((between @ c @ between.T).item() for c in covariances)))
     away = slow @ log_focal
-    evidence = min(float(away @ np.linalg.solve(slow @ c @ slow.T, away)) for c in covariances)
+    evidence = min(squared_deviations(away, slow @ c @ slow.T) for c in covariances)
     logger.info(
         "zoom of %.2f %% within %.2f %%, %.0f squared deviations; spread %.1e a frame, tracks %.3f px (%.3f without)",
         100 * np.expm1(change), 100 * std, evidence, spread, best.sigma, known.sigma,

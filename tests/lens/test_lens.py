@@ -57,11 +57,13 @@ def assert_derivative(analytic, function, size, step=1e-6):
 
 def test_distortion_derivatives_and_inverse():
     uv = np.random.default_rng(0).uniform(-0.6, 0.6, (50, 2))
+    uv[40:] *= 10.0  # some of them beyond the field of view that the polynomial is for
+    assert 5 < (np.linalg.norm(uv, axis=1) > 2.0).sum() <= 10
     shape = np.array([-0.15, 0.04, 0.01, -0.02])
     distorted, by_uv, by_lens = distort(uv, shape)
     assert_derivative(by_uv, lambda d: distort(uv + d, shape)[0], 2)
     assert_derivative(by_lens, lambda d: distort(uv, shape + d)[0], 4)
-    np.testing.assert_allclose(undistort(distorted, shape), uv, atol=1e-9)
+    np.testing.assert_allclose(undistort(distorted[:40], shape), uv[:40], atol=1e-9)
 
 
 @pytest.mark.parametrize("group", [[0, 0, 0, 0, 0], [1, 0, 2, 2, 1]])
@@ -373,3 +375,33 @@ def test_the_command_line_takes_what_is_free(capsys):
     with pytest.raises(SystemExit):
         main(["reconstruct", "shot.mp4", "--output", "out", "--lens", "wide"])
     assert "--lens" in capsys.readouterr().err
+
+
+def test_a_match_that_is_seen_far_outside_of_the_image_says_nothing_of_the_distortion():
+    """A point that the camera has passed by: a wrong match puts it into the last image all the same."""
+    problem = make_problem("dolly", frames=6, points=300, parallax=0.3, noise_px=0.01)
+    truth, o, n = problem.truth, problem.observations, len(problem.points)
+    rotation, translation = truth.rotation[-1], truth.translation[-1]
+    beside = rotation.T @ (np.array([0.05, 0.0, 1e-4]) - translation)
+    q = (truth.rotation @ beside + truth.translation)[:3]
+    seen = np.concatenate([q[:, :2] / q[:, 2:], [[0.1, -0.05]]])
+    assert np.abs(seen).max() < 0.5
+    observations = Observations(
+        np.append(o.frame, [0, 1, 2, 5]), np.append(o.point, np.full(4, n)), np.concatenate([o.xy, seen])
+    )
+    start = replace(
+        truth,
+        bearing=np.concatenate([truth.bearing, beside[None] / np.linalg.norm(beside)]),
+        inverse_distance=np.append(truth.inverse_distance, 1.0 / np.linalg.norm(beside)),
+    )
+    known = Known(lens=LensPrior(np.zeros(6), np.array([0.1, 0.1, 0.0, 0.0, 0.0, 0.0])))
+    found = []
+    for state, some in ((truth, o), (start, observations)):
+        adjustment = BundleAdjustment(
+            state, some, PolishOptions(), ErrorModel(0.01), free=Free(focal=True), known=known
+        )
+        found.append((adjustment.solve().lens[:2], np.sqrt(adjustment.marginals().camera.diagonal())))
+    (without, std), (beside_it, other_std) = found
+    std, other_std = (s[adjustment.columns.lens][:2] for s in (std, other_std))
+    assert ((other_std / std > 0.7) & (other_std / std < 2.0)).all()
+    assert (np.abs(beside_it - without) < 2.0 * std).all()

@@ -1,0 +1,50 @@
+"""What is not determined counts as unobservable: no division by zero, no negative variance."""
+
+import numpy as np
+import pytest
+
+from factorsfm.adjustment.semidefinite import conditioned, covariance_of, solution, squared_deviations
+
+
+def information_without(direction, scales):
+    """(n, n) of random measurements that say nothing along a direction, of variables in very different units."""
+    rng = np.random.default_rng(0)
+    seen = rng.standard_normal((40, len(direction)))
+    seen -= np.outer(seen @ direction, direction) / (direction @ direction)
+    return seen.T @ seen * np.outer(scales, scales)
+
+
+@pytest.mark.parametrize("rounding", [-1e-9, 0.0, 1e-15])
+def test_an_undetermined_direction_is_very_uncertain_and_the_others_are_as_they_are(rounding):
+    direction, scales = np.array([1.0, -2.0, 0.5, 0.0, 1.0]), np.array([1e6, 1.0, 1e-3, 10.0, 1e2])
+    information = information_without(direction, scales)
+    information[0, 0] *= 1.0 + rounding  # the elimination leaves such errors
+    covariance = covariance_of(conditioned(information))
+    assert (np.linalg.eigvalsh(covariance * np.outer(scales, scales)) > 0.0).all()
+    unseen = direction / scales
+    assert unseen @ covariance @ unseen > 1e3
+    seen = np.array([0.0, 0.0, 0.0, 1.0, 0.0])  # the only one that has no part in the direction
+    assert seen @ covariance @ seen == pytest.approx(
+        np.linalg.pinv(information_without(direction, scales))[3, 3], rel=0.1
+    )
+
+
+def test_a_variable_that_nothing_sees_stays_where_it_is():
+    information = np.diag([4.0, 0.0, 2.0])
+    np.testing.assert_allclose(solution(information, np.array([8.0, 3.0, 1.0])), [2.0, 0.0, 0.5], rtol=1e-12)
+    np.testing.assert_allclose(covariance_of(information).diagonal(), [0.25, 1e12, 0.5])
+
+
+def test_a_determined_system_is_solved_as_it_is():
+    information = information_without(np.array([1.0, 1.0, 0.0]), np.ones(3)) + 0.1 * np.eye(3)
+    gradient = np.array([1.0, -2.0, 3.0])
+    np.testing.assert_array_equal(solution(information, gradient), np.linalg.solve(information, gradient))
+    np.testing.assert_array_equal(covariance_of(information), np.linalg.inv(information))
+
+
+def test_evidence_from_few_samples_is_not_negative():
+    samples = np.random.default_rng(1).standard_normal((2, 4))
+    covariance = samples.T @ samples
+    along, across = samples[0], np.linalg.svd(samples)[2][3]
+    assert squared_deviations(along, covariance) == pytest.approx(along @ np.linalg.pinv(covariance) @ along, rel=1e-5)
+    assert squared_deviations(across, covariance) > 1e6
