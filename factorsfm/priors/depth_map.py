@@ -17,7 +17,7 @@ _EDGE_WINDOW = 0.015  # side of the window in which a depth edge is looked for, 
 # second an edge.
 _SLOPE_RANGE, _EDGE_RANGE = 0.08, 0.25
 _LEAST_SPREAD = 0.02  # of a map over its median: a flatter map is noise and has no edges
-_SPREAD_SAMPLES = 100_000  # about as many pixels tell the spread of a map
+_SPREAD_SAMPLES = 100_000  # number of pixels, about, from which the spread of a map is measured
 
 
 class DepthKind(StrEnum):
