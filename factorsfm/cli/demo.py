@@ -7,16 +7,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from factorsfm import api
 from factorsfm.camera.files import read_camera
 from factorsfm.evaluation.metrics import TrajectoryErrors, trajectory_errors
+from factorsfm.export.writing import complete_file
+from factorsfm.frames.writing import write_image
 from factorsfm.report.picture import draw_picture
 from factorsfm.report.result_folder import check_directory, write_folder
 from factorsfm.result.reconstruction import Reconstruction
-from factorsfm.support.errors import InputError
 from factorsfm.support.similarity import pose_arrays
 from factorsfm.synthetic import render_shot, write_shot
 
@@ -76,6 +76,6 @@ def run_demo(directory: str | Path, progress: Callable[[str, int, int | None], N
     path_length = float(np.linalg.norm(np.diff(truth[1], axis=0), axis=1).sum())
     reconstruction.options["source"] = "rendered shot"  # its file is gone
     write_folder(reconstruction, directory)
-    if not cv2.imwrite(str(Path(directory) / "picture.png"), draw_picture(reconstruction)):
-        raise InputError(f"cannot write the picture into {directory}")
+    with complete_file(Path(directory) / "picture.png") as file:
+        write_image(file, draw_picture(reconstruction))
     return DemoResult(reconstruction, errors, path_length)

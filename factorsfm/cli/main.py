@@ -27,8 +27,11 @@ from factorsfm.priors.depth_map import DepthKind
 from factorsfm.report.result_folder import check_directory, write_failure, write_folder
 from factorsfm.result.summary import conclusion
 from factorsfm.support.errors import FactorsfmError, ReconstructionError
+from factorsfm.support.json_text import as_text, is_text
 from factorsfm.support.options import PRESETS, LensFreedom, ShutterUse
 from factorsfm.support.program import program_version
+
+logger = logging.getLogger(__name__)
 
 BAD_INPUT, NOT_RECONSTRUCTED, INTERRUPTED = 2, 3, 130
 
@@ -39,18 +42,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         The exit status: 0 done, 2 bad input, 3 the shot cannot be reconstructed, 130 interrupted.
     """
-    arguments = _parser().parse_args(argv)
+    parser = _parser()
+    given = sys.argv[1:] if argv is None else list(argv)
+    if strange := [argument for argument in given if not is_text(argument)]:
+        parser.error(f"the argument {strange[0]!r} is not UTF-8")
+    arguments = parser.parse_args(given)
     progress = _Progress(sys.stderr, enabled=sys.stderr.isatty() and not arguments.verbose)
     level = (logging.WARNING, logging.INFO, logging.DEBUG)[min(arguments.verbose, 2)]
     # Bad input is one line for scripts; until it is known, warnings wait, except where somebody follows the run.
     followed = sys.stderr.isatty() or arguments.verbose or arguments.command in ("stream", "batch")
     log = MemoryHandler(1000, logging.DEBUG if followed else logging.CRITICAL, _LogHandler(progress))
     logging.basicConfig(level=level, handlers=[log])
+    logging.captureWarnings(True)
     try:
         with progress:
             said = _run(arguments, progress)
             progress.clear()
-            print(said)
+            print(as_text(said))
     except ReconstructionError as error:
         return _complain(f"error: {error}", NOT_RECONSTRUCTED)
     except FactorsfmError as error:
@@ -58,6 +66,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _complain(f"error: {error}", BAD_INPUT)
     except KeyboardInterrupt:
         return _complain("interrupted", INTERRUPTED)
+    except (OSError, MemoryError) as error:  # of the machine, not of the program
+        logger.debug("", exc_info=True)
+        log.buffer.clear()
+        return _complain(f"error: {str(error) or 'not enough memory'}", BAD_INPUT)
     finally:
         log.flush()
     return 0

@@ -49,6 +49,7 @@ class KnownPose:
     rotation_sigma: float | None = None
 
     def __post_init__(self) -> None:
+        _check_frame(self.frame)
         if self.position is None and self.cam_from_world is None:
             raise InputError('neither "position" nor "cam_from_world" is given')
         _check_vector("position", self.position, 3)
@@ -156,6 +157,7 @@ class KnownHeight:
     sigma: float
 
     def __post_init__(self) -> None:
+        _check_frame(self.frame)
         _check_sigma("length", self.length, True)
         _check_sigma("sigma", self.sigma, True)
         if len({*self.above}) != 3 or len(self.above) != 3:
@@ -324,6 +326,11 @@ def _check_vector(name: str, value: Any, length: int) -> None:
     good = isinstance(value, Sequence | np.ndarray) and not isinstance(value, str) and len(value) == length
     if not good or not all(_is_number(v) for v in value):
         raise InputError(f'"{name}" is {value!r}; {length} finite numbers are expected')
+
+
+def _check_frame(key: Any) -> None:
+    if isinstance(key, bool) or not isinstance(key, str | int):
+        raise InputError(f'"frame" is {key!r}; the name or the index of a frame is expected')
 
 
 def _check_sigma(name: str, value: Any, needed: bool, *, zero: bool = False) -> None:

@@ -27,10 +27,17 @@ def write_alembic(shot: Shot, path: Path) -> None:
         times.append(number / shot.fps)
     sampling = core.TimeSampling(core.TimeSamplingType(core.AcyclicFlag.kAcyclic), times)
 
+    _check_room(path, 64 * 1024 + 1024 * len(shot.numbers) + 64 * len(shot.reconstruction.points))
     with failures_as_os_errors():
         archive = abc.OArchive(str(path), asOgawa=True)
         _write_camera(shot, archive, archive.addTimeSampling(sampling), geom, imath)
         _write_points(shot, archive, geom, imath)
+
+
+def _check_room(path: Path, size: int) -> None:
+    """Where the disk is full, Alembic ends the whole program; this raises an OSError before."""
+    with path.open("wb") as file:
+        file.write(bytes(size))
 
 
 def _write_camera(shot: Shot, archive: Any, sampling: int, geom: Any, imath: Any) -> None:

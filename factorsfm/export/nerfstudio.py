@@ -7,7 +7,6 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pycolmap
 
@@ -15,6 +14,7 @@ from factorsfm.export.image_names import image_name
 from factorsfm.export.ply import write_ply
 from factorsfm.export.shot import Shot
 from factorsfm.frames.reading import read_frames
+from factorsfm.frames.writing import write_image
 from factorsfm.result.image_sources import image_sources
 from factorsfm.support.errors import InputError
 from factorsfm.support.json_text import json_text
@@ -112,8 +112,6 @@ def _write_images(footage: Path, names: dict[int, str], folder: Path) -> None:
         if frame.index not in missing:
             continue
         missing.remove(frame.index)
-        target = folder / names[frame.index]
-        if not cv2.imwrite(str(target), frame.image):
-            raise OSError(f"the image {target.name} cannot be written")
+        write_image(folder / names[frame.index], frame.image)
     if missing:
         raise InputError(f"the footage {footage} lacks frame {min(missing)}, counted from 0")

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
 from factorsfm.support.errors import InputError
+
+# What every format can hold; beyond, a unit has been mistaken.
+_RANGES: dict[str, tuple[float, float, str]] = {
+    "fps": (1e-3, 1e6, "frames per second"),
+    "first_frame": (-1e9, 1e9, "the number of a frame"),
+    "sensor_width": (1e-3, 1e6, "millimetres"),
+    "scale": (1e-9, 1e9, "a length"),
+}
 
 
 class UpAxis(StrEnum):
@@ -44,10 +51,10 @@ class ExportOptions:
     footage: str | Path | None = None
 
     def __post_init__(self) -> None:
-        for name, meaning in (("fps", "frames per second"), ("sensor_width", "millimetres"), ("scale", "a length")):
+        for name, (low, high, unit) in _RANGES.items():
             value = getattr(self, name)
-            if value is not None and not (math.isfinite(value) and value > 0):
-                raise InputError(f"{name} is {value:g}; a positive number ({meaning}) is expected")
+            if value is not None and not low <= value <= high:
+                raise InputError(f"{name} is {value:g}; a number from {low:g} to {high:g} ({unit}) is expected")
         if self.up_axis is not None and self.up_axis not in set(UpAxis):
             raise InputError(f'up_axis is "{self.up_axis}"; one of {", ".join(UpAxis)} is expected')
         if self.footage is not None and not Path(self.footage).exists():

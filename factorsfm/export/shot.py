@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from factorsfm.export.options import ExportOptions, UpAxis
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
+from factorsfm.support.errors import InputError
 
 _TURNED_WORLD = {  # exported world from the reconstruction's
     UpAxis.MINUS_Y: np.eye(3),
@@ -225,6 +226,9 @@ def _in_world(reconstruction: Reconstruction, world: NDArray[np.float64], scale:
         if pose is not None:
             frame.cam_from_world = pycolmap.Rigid3d(pose.rotation * old_from_new, scale * pose.translation)
     points = scale * reconstruction.points.reshape(-1, 3) @ world.T
+    translations = [frame.cam_from_world.translation for frame in frames if frame.cam_from_world is not None]
+    if not (np.isfinite(points).all() and np.isfinite(translations).all()):
+        raise InputError(f"the scene is not finite at scale {scale:g}")
     return replace(reconstruction, frames=frames, points=points)
 
 

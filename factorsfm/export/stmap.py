@@ -13,6 +13,7 @@ from factorsfm.camera.projection import PIXEL_CENTER
 from factorsfm.export.shot import Shot
 from factorsfm.export.vfx import failures_as_os_errors, require
 from factorsfm.frames.reading import read_frames
+from factorsfm.frames.writing import write_image
 from factorsfm.support.errors import InputError
 
 Array = NDArray[np.float64]
@@ -65,8 +66,7 @@ def write_undistorted(shot: Shot, folder: Path) -> None:
             x, y = _straightening(own[frame.index])
         plate = cv2.remap(frame.image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)
         name = f"plate.{shot.first_frame + frame.index:04d}.png"
-        if not cv2.imwrite(str(folder / name), plate):
-            raise OSError(f"the image {name} cannot be written")
+        write_image(folder / name, np.asarray(plate, np.uint8))
 
 
 def _cameras(shot: Shot) -> list[tuple[str, pycolmap.Camera]]:

@@ -28,7 +28,7 @@ def camera_number(source: object) -> int | None:
             raise InputError(f"{source} is no camera; they are counted from 0")
         return source
     match = re.fullmatch(r"camera:(.*)", source) if isinstance(source, str) else None
-    if match is not None and not re.fullmatch(r"\d+", match[1], re.ASCII):
+    if match is not None and not re.fullmatch(r"\d{1,9}", match[1], re.ASCII):
         raise InputError(f'"{source}" names no camera; camera:0 is the first one')
     return None if match is None else int(match[1])
 

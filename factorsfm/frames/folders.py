@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.video import quiet_opencv
 from factorsfm.support.errors import InputError
+from factorsfm.support.json_text import is_text
 
 logger = logging.getLogger(__name__)
 
@@ -34,12 +35,19 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def list_files(folder: Path, suffixes: Collection[str]) -> list[Path]:
-    """Files of a folder with one of these suffixes (lower case) in natural order, without hidden files."""
+    """Files of a folder with one of these suffixes (lower case) in natural order, without hidden files.
+
+    Raises:
+        InputError: the name of one of them is not text.
+    """
     found = [
         path
         for path in folder.iterdir()
         if path.suffix.lower() in suffixes and not path.name.startswith(".") and path.is_file()
     ]
+    for path in found:
+        if not is_text(path.name):
+            raise InputError(f"the file name {path.name!r} in {folder} is not UTF-8; rename the file")
     return sorted(found, key=_natural_key)
 
 
@@ -136,9 +144,14 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     # Checked before decoding: libjpeg would fill the rest with grey, libpng would write to stderr, past all logging.
     if _is_truncated(data):
         raise InputError(f"image {path} is truncated")
-    with quiet_opencv():
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
-        other = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data and image is None else None
+    try:
+        with quiet_opencv():
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+            other = (
+                cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if image is None and data else None
+            )
+    except cv2.error as error:
+        raise InputError(f"image {path} cannot be decoded; it has too many pixels or is damaged") from error
     if other is not None:
         raise InputError(f"image {path} has pixels of {other.dtype}; 8 or 16 bits a channel are expected")
     if image is None:

@@ -6,7 +6,7 @@ import re
 
 from factorsfm.support.errors import InputError
 
-_RANGE = re.compile(r"(\d*):(\d*)(?::(\d+))?", re.ASCII)
+_RANGE = re.compile(r"(\d{0,18}):(\d{0,18})(?::(\d{1,18}))?", re.ASCII)
 
 
 def parse_range(text: str) -> slice:

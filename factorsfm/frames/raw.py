@@ -54,7 +54,7 @@ class RawFormat:
         Raises:
             InputError: another form, or there is no such format.
         """
-        match = re.fullmatch(r"(\d+)x(\d+):(\w+)", text.strip(), re.ASCII)
+        match = re.fullmatch(r"(\d{1,6})x(\d{1,6}):(\w+)", text.strip(), re.ASCII)
         if match is None:
             raise InputError(f'raw format "{text}" is not WIDTHxHEIGHT:PIXELS, for example 960x540:bgr24')
         return cls(int(match[1]), int(match[2]), match[3])

@@ -18,7 +18,7 @@ from factorsfm.frames.reading import read_frames
 from factorsfm.frames.unordered import read_images
 from factorsfm.imagesets.joint_adjustment import View, extended, local_pose
 from factorsfm.imagesets.mapper import SetMapper, for_image_sets
-from factorsfm.imagesets.photo_folder import pixel_digest, work_folder
+from factorsfm.imagesets.photo_folder import pixel_digest, work_folder, write_once
 from factorsfm.result.image_sources import AddedImages, ImageSource, added_images, image_sources
 from factorsfm.result.reading import read_result
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
@@ -101,7 +101,6 @@ class _Extension:
         distance = np.linalg.norm(first * base.points, axis=1) if len(base.points) else np.ones(1)
         unit = float(np.median(1.0 / np.maximum(distance, 1e-9)))
         self._local = Similarity(unit, np.asarray(first.rotation.matrix()), unit * np.asarray(first.translation))
-        (folder / "images").mkdir(parents=True, exist_ok=True)
 
     # --- images -------------------------------------------------------------------------------------------------
 
@@ -189,9 +188,7 @@ class _Extension:
 
     def _view(self, image: Frame, frame: FrameResult, position: int) -> View:
         file = f"{position:06d}-{pixel_digest(image.image)}.png"
-        target = self._folder / "images" / file
-        if not target.exists() and not cv2.imwrite(str(target), image.image, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
-            raise InputError(f"cannot write to the work folder {self._folder}")
+        write_once(self._folder / "images" / file, image.image)
         none = np.zeros((0, 2))
         size = image.image.shape[1], image.image.shape[0]
         return View(frame, position, file, size, np.zeros(0, np.int64), none, np.zeros((0, 3), np.uint8))

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.frames.frame import Frame
+from factorsfm.frames.writing import FAST_PNG, write_image
 from factorsfm.support.errors import InputError
 
 logger = logging.getLogger(__name__)
@@ -85,10 +86,10 @@ class PhotoFolder:
         if first != position:
             photo.twin = first
             return photo
-        _write_once(self.images / photo.file, image)
+        write_once(self.images / photo.file, image)
         if self.masks is not None:
             ignored = np.zeros(image.shape[:2], bool) if mask is None else mask
-            _write_once(self.masks / f"{photo.file}.png", np.where(ignored, 0, 255).astype(np.uint8))
+            write_once(self.masks / f"{photo.file}.png", np.where(ignored, 0, 255).astype(np.uint8))
         return photo
 
     def read(self, photo: Photo) -> NDArray[np.uint8]:
@@ -98,10 +99,10 @@ class PhotoFolder:
     def turn(self, photo: Photo) -> None:
         """Turn the working copy by 90 degrees."""
         turned = photo.file.replace(".png", "-turned.png")
-        _write_once(self.images / turned, cv2.rotate(self.read(photo), cv2.ROTATE_90_COUNTERCLOCKWISE))
+        write_once(self.images / turned, cv2.rotate(self.read(photo), cv2.ROTATE_90_COUNTERCLOCKWISE))
         if self.masks is not None:
             sideways = cv2.imread(str(self.masks / f"{photo.file}.png"), cv2.IMREAD_GRAYSCALE)
-            _write_once(self.masks / f"{turned}.png", cv2.rotate(sideways, cv2.ROTATE_90_COUNTERCLOCKWISE))
+            write_once(self.masks / f"{turned}.png", cv2.rotate(sideways, cv2.ROTATE_90_COUNTERCLOCKWISE))
         photo.remark = "turned left by 90 degrees to the format of the others; its pose is that of the turned image"
         logger.warning("%s is %s", photo.name, photo.remark)
         photo.file, photo.size, photo.full_size = turned, photo.size[::-1], photo.full_size[::-1]
@@ -134,21 +135,35 @@ def _bounded(
     return reduced, cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
 
 
-def _write_once(path: Path, image: NDArray[np.uint8]) -> None:
-    """Write a file that is complete or absent."""
+def write_once(path: Path, image: NDArray[np.uint8]) -> None:
+    """Write an image into a work folder, unless it is there; a file there is complete.
+
+    Raises:
+        InputError: it cannot be written.
+    """
     if path.exists():
         return
-    path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_suffix(".unfinished.png")
-    if not cv2.imwrite(str(unfinished), image, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
-        raise InputError(f"cannot write to the work folder {path.parent}")
-    unfinished.replace(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_image(unfinished, image, FAST_PNG)
+        unfinished.replace(path)
+    except OSError as error:
+        raise InputError(f"cannot write to the work folder {path.parent}: {error.strerror or error}") from error
 
 
 @contextmanager
 def work_folder(work: str | Path | None) -> Iterator[Path]:
-    """The folder, or a temporary one where there is none."""
+    """The folder, or a temporary one where there is none.
+
+    Raises:
+        InputError: it cannot be made.
+    """
     if work is not None:
+        try:
+            Path(work).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"the work folder {work} cannot be made: {error.strerror}") from error
         yield Path(work)
         return
     with tempfile.TemporaryDirectory(prefix="factorsfm-") as folder:

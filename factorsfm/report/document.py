@@ -6,6 +6,8 @@ from html import escape
 from importlib.resources import files
 from string import Template
 
+from factorsfm.support.json_text import as_text
+
 
 def document(title: str, body: str, *, styles: str = "", scripted: bool = False) -> str:
     """A whole page.
@@ -14,12 +16,13 @@ def document(title: str, body: str, *, styles: str = "", scripted: bool = False)
         title: plain text; body: HTML; styles: CSS besides that of all pages.
         scripted: whether the body has scripts, which are refused otherwise.
     """
-    return Template(packaged("factorsfm.report", "document.html")).substitute(
+    page = Template(packaged("factorsfm.report", "document.html")).substitute(
         title=escape(title),
         script_policy="script-src 'unsafe-inline'; " if scripted else "",
         style=packaged("factorsfm.report", "page.css") + styles,
         body=body,
     )
+    return as_text(page)
 
 
 def packaged(package: str, name: str) -> str:

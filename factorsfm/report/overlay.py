@@ -131,6 +131,8 @@ def write_overlay(
                 video.write(cv2.copyMakeBorder(image, 0, below, 0, right, cv2.BORDER_REPLICATE))
         finally:
             video.release()
+        if (kept := _count_frames(file)) < len(frames):  # OpenCV says nothing of a full disk
+            raise OSError(f"only {kept} of {len(frames)} frames are in the file; is the disk full?")
     return props
 
 
@@ -177,6 +179,15 @@ def _footage(source: Path, reconstruction: Reconstruction) -> Iterator[Frame]:
                 f"frame {index} of {source} has {width}x{height} pixels, the result {camera.width}x{camera.height}"
             )
         yield found
+
+
+def _count_frames(video: Path) -> int:
+    capture = cv2.VideoCapture(str(video))
+    count = 0
+    while capture.grab():
+        count += 1
+    capture.release()
+    return count
 
 
 def _draw_grid(canvas: Image, lines: Array) -> None:

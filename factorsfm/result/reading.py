@@ -11,7 +11,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.camera.files import camera_from_json
+from factorsfm.camera.files import camera_from_json, camera_to_json
 from factorsfm.camera.projection import PIXEL_CENTER
 from factorsfm.control.fit import ControlFit
 from factorsfm.polish.observability import CameraObservability
@@ -23,7 +23,7 @@ from factorsfm.support.json_reading import read_json, typed
 from factorsfm.support.program import PROGRAM
 from factorsfm.support.status import FrameStatus, ShotKind
 
-_MOST_FRAMES = 2**31 - 1  # a COLMAP image has the index of its frame + 1 as identifier
+_MOST_FRAMES = 10**9  # more than any film has; numbers of frames stay within 32 bits in all exports
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +79,7 @@ def read_result(directory: str | Path) -> Reconstruction:
     try:
         summary = typed(_Summary, content, "summary.json")
         result = _reconstruction(summary, pycolmap.Reconstruction(directory / "colmap"))
-    except (InputError, OSError, ValueError, KeyError, RuntimeError) as error:
+    except (InputError, OSError, ValueError, LookupError, RuntimeError) as error:
         raise InputError(f"the result in {directory} is damaged: {error}") from error
     result.others = [read_result(directory / part_name(number)) for number in range(2, summary.parts + 1)]
     return result
@@ -100,8 +100,8 @@ def _content(directory: Path) -> dict[str, Any]:
 
 
 def _reconstruction(summary: _Summary, model: pycolmap.Reconstruction) -> Reconstruction:
-    if not model.cameras:
-        raise InputError("its COLMAP model has no camera")
+    if not model.cameras or not summary.statuses:
+        raise InputError("it has no camera or no frame")
     own = len(model.cameras) > 1
     camera = camera_from_json(summary.camera) if own else _copy(next(iter(model.cameras.values())))
     images = {image_id - 1: image for image_id, image in model.images.items()}
@@ -179,5 +179,6 @@ def _seen(
 
 
 def _copy(camera: pycolmap.Camera) -> pycolmap.Camera:
-    """A camera that outlives its model."""
+    """A camera that outlives its model, if it is one that a camera file might hold."""
+    camera_from_json(camera_to_json(camera))
     return pycolmap.Camera(camera.todict())

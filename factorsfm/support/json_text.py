@@ -18,13 +18,23 @@ def json_text(value: Any, indent: int | None = 1) -> str:
 
 def _plain(value: Any) -> Any:
     if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {as_text(str(key)): _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
     if isinstance(value, np.ndarray | np.generic):
         return _plain(value.tolist())
     if isinstance(value, float):
         return value if math.isfinite(value) else None
-    if value is None or isinstance(value, bool | int | str):
+    if value is None or isinstance(value, bool | int):
         return value
-    return str(value)
+    return as_text(str(value))
+
+
+def is_text(value: str) -> bool:
+    """Whether a string can be written as UTF-8; a file name of other bytes cannot."""
+    return value == as_text(value)
+
+
+def as_text(value: str) -> str:
+    """The same with escapes in place of what cannot be written as UTF-8."""
+    return value.encode("utf-8", "backslashreplace").decode("utf-8")

@@ -17,6 +17,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from factorsfm.camera.projection import PIXEL_CENTER
+from factorsfm.support.errors import InputError
 from factorsfm.tracks.learned import LearnedFeatures, common_features, find_all, match_pairs
 
 Array = NDArray[np.float64]
@@ -76,6 +77,9 @@ def match_images(
         cameras: one per image; `has_prior_focal_length` decides whether the verification uses the lens.
         masks: folder with a file "NAME.png" for every image, zero = ignore.
         features: None for SIFT. A database holds features of one kind.
+
+    Raises:
+        InputError: the file is not a database.
     """
     pycolmap.set_random_seed(_SEED)
     if database.exists() and not _stored_names(database) <= set(names):
@@ -117,8 +121,11 @@ def read_matches(database: Path, names: Sequence[str]) -> SetMatches:
 
 
 def _stored_names(database: Path) -> set[str]:
-    with pycolmap.Database.open(database) as db:
-        return {image.name for image in db.read_all_images()}
+    try:
+        with pycolmap.Database.open(database) as db:
+            return {image.name for image in db.read_all_images()}
+    except RuntimeError as error:
+        raise InputError(f"{database} is not a database of COLMAP; remove it, or name another work folder") from error
 
 
 def _extract(

@@ -629,10 +629,12 @@ def test_output_can_be_the_working_directory(tmp_path: Path, monkeypatch: pytest
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"fps": 0}, "fps is 0; a positive number"),
-        ({"fps": math.nan}, "fps is nan; a positive number"),
-        ({"sensor_width": -36}, "sensor_width is -36; a positive number"),
-        ({"scale": math.inf}, "scale is inf; a positive number"),
+        ({"fps": 0}, "fps is 0; a number from 0.001 to 1e\\+06"),
+        ({"fps": math.nan}, "fps is nan; a number from"),
+        ({"sensor_width": -36}, "sensor_width is -36; a number from"),
+        ({"scale": math.inf}, "scale is inf; a number from"),
+        ({"scale": 1e10}, r"scale is 1e\+10; a number from 1e-09 to 1e\+09 \(a length\) is expected"),
+        ({"first_frame": 10**30}, r"first_frame is 1e\+30; a number from"),
         ({"up_axis": "x"}, 'up_axis is "x"; one of y, z, -y is expected'),
         ({"footage": "no/such/file"}, "the footage no/such/file does not exist"),
     ],
