@@ -72,7 +72,7 @@ def weigh_prior(
     inflation: float,
 ) -> WeighedPrior | None:
     """Measure how far the prior can be trusted on this shot; None where there is none or it is no prior."""
-    values = _prior_values(images, observations, tracks)
+    values = prior_values(images, observations, tracks)
     if values is None:
         return None
     point = observations.point[values.at]
@@ -112,7 +112,7 @@ def usual_prior(
     Args:
         affines: scale and shift of each image as far as they are known.
     """
-    values = _prior_values(images, observations, tracks)
+    values = prior_values(images, observations, tracks)
     if values is None:
         return None
     scale, shift = np.array([affines[row] or (1.0, 0.0) for row in values.rows]).T
@@ -131,7 +131,7 @@ def joint_problem(
     track_errors: TrackErrors | None = None,
 ) -> tuple[BundleAdjustment, PriorPart]:
     """Tracks and the prior at its weight; `fixed` and `track_errors` as in `BundleAdjustment`."""
-    values = _prior_values(images, observations, tracks, weighed.rows)
+    values = prior_values(images, observations, tracks, weighed.rows)
     assert values is not None
     first_scale, first_shift = (
         affine[np.searchsorted(weighed.rows, values.rows)] for affine in (weighed.scale, weighed.shift)
@@ -154,7 +154,7 @@ def joint_problem(
 
 
 @dataclass(frozen=True, slots=True)
-class _PriorValues:
+class PriorValues:
     """Rows of the frames with a prior; and per value its image, its observation and the inverse depth."""
 
     rows: Index
@@ -164,9 +164,9 @@ class _PriorValues:
     free_shift: bool
 
 
-def _prior_values(
+def prior_values(
     images: Sequence[ImageTracks], observations: Observations, tracks: Index, among: Index | None = None
-) -> _PriorValues | None:
+) -> PriorValues | None:
     """Values of the prior at the observations, sorted as these; None where no frame (among some) carries any."""
     rows: list[int] = []
     image, at, value = [], [], []
@@ -190,6 +190,6 @@ def _prior_values(
     flat = np.concatenate(at)
     by_point = np.argsort(flat, kind="stable")
     free_shift = all(images[r].depth.free_shift for r in rows)  # type: ignore[union-attr]
-    return _PriorValues(
+    return PriorValues(
         np.array(rows), np.concatenate(image)[by_point], flat[by_point], np.concatenate(value)[by_point], free_shift
     )  # fmt: skip

@@ -191,3 +191,57 @@ def affine_of_native(affine: gtsam.Cal3_S2) -> tuple[float, float]:
 def native_affine_noise(scale_sigma: float, shift_sigma: float) -> gtsam.noiseModel.Base:
     """Noise of a prior on a native affine; what has no meaning is pinned."""
     return gtsam.noiseModel.Diagonal.Sigmas(np.array([scale_sigma / VIRTUAL_BASELINE, 1e-6, 1e-6, shift_sigma, 1e-6]))
+
+
+# --- the keyframe graph -------------------------------------------------------------------------------------------
+
+KERNEL = 2.0  # Cauchy scale of measurements, standard deviations
+
+
+def _robust(noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Robust:
+    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(KERNEL), noise)
+
+
+def pixel_noise(sigma: float) -> gtsam.noiseModel.Robust:
+    """Of an observation: `sigma` (pixels) of each coordinate, in a Cauchy kernel."""
+    return _robust(gtsam.noiseModel.Isotropic.Sigma(2, sigma))
+
+
+def depth_noise(sigma: float) -> gtsam.noiseModel.Robust:
+    """Of `native_depth_factor`: `sigma` in the unit of the prior, in a Cauchy kernel; the second row means nothing."""
+    return _robust(gtsam.noiseModel.Diagonal.Sigmas(np.array([sigma, 1e6])))
+
+
+def projection_factor(
+    pixels: Array, noise: gtsam.noiseModel.Base, pose_key: int, point_key: int, lens: gtsam.Cal3_S2
+) -> gtsam.GenericProjectionFactorCal3_S2:
+    """Reprojection residual on (pose, landmark), `residuals.reprojection`.
+
+    Args:
+        pixels: (2,) undistorted observation relative to the principal point of `lens`.
+    """
+    return gtsam.GenericProjectionFactorCal3_S2(pixels, noise, pose_key, point_key, lens)
+
+
+def constant_projection_factor(
+    camera: gtsam.PinholePoseCal3_S2, pixels: Array, noise: gtsam.noiseModel.Base, point_key: int
+) -> gtsam.TriangulationFactorPoseCal3_S2:
+    """The same residual of a camera that does not change, on the landmark alone."""
+    return gtsam.TriangulationFactorPoseCal3_S2(camera, pixels, noise, point_key)
+
+
+def pose_prior(key: int, pose: gtsam.Pose3, sigma: float) -> gtsam.PriorFactorPose3:
+    """Prior of a pose around its value, `sigma` in radians and units of length alike."""
+    return gtsam.PriorFactorPose3(key, pose, gtsam.noiseModel.Isotropic.Sigma(6, sigma))
+
+
+def landmark_prior(key: int, point: Array, sigma: float) -> gtsam.PriorFactorPoint3:
+    """Prior of a landmark around its value (3,), `sigma` in units of length."""
+    return gtsam.PriorFactorPoint3(key, point, gtsam.noiseModel.Isotropic.Sigma(3, sigma))
+
+
+def affine_prior(
+    key: int, scale: float, shift: float, scale_sigma: float, shift_sigma: float
+) -> gtsam.PriorFactorCal3_S2:
+    """Prior of a native affine around a scale and a shift."""
+    return gtsam.PriorFactorCal3_S2(key, native_affine(scale, shift), native_affine_noise(scale_sigma, shift_sigma))

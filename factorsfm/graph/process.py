@@ -23,7 +23,7 @@ from multiprocessing import spawn
 from pathlib import Path
 from typing import IO, TypeVar, cast
 
-from factorsfm.graph.keyframe_graph import FactorGraph
+from factorsfm.graph.keyframe_graph import KeyframeGraph
 from factorsfm.graph.server import Answer, Request
 from factorsfm.support.context import Closing
 from factorsfm.support.errors import FactorsfmError
@@ -58,7 +58,7 @@ class GraphProcess(Closing):
         """Do some work in a thread beside everything else, after all that was submitted before; it may `ask`."""
         return self._worker.submit(work)
 
-    def ask(self, update: Callable[[Subject, FactorGraph], Result], subject: Subject) -> Result:
+    def ask(self, update: Callable[[Subject, KeyframeGraph], Result], subject: Subject) -> Result:
         """``update(subject, graph)`` in the process; raises what it raises there.
 
         Args:

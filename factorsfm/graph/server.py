@@ -15,7 +15,7 @@ from typing import Any
 
 import pycolmap  # noqa: F401  with the images; its import sets a handler of SIGTERM, which `serve` then replaces
 
-from factorsfm.graph.keyframe_graph import FactorGraph
+from factorsfm.graph.keyframe_graph import KeyframeGraph
 from factorsfm.support.threads import OneThreadEach
 
 
@@ -27,7 +27,7 @@ class Request:
         update: a function of a module, which crosses to the process by its name.
     """
 
-    update: Callable[[Any, FactorGraph], Any]
+    update: Callable[[Any, KeyframeGraph], Any]
     subject: Any
     anew: bool
 
@@ -63,19 +63,19 @@ def serve() -> None:
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # what libraries print must not get in between
     kept = _Kept()
     logging.getLogger().addHandler(kept)
-    graph = FactorGraph()
+    graph = KeyframeGraph()
     with OneThreadEach(), contextlib.suppress(EOFError, BrokenPipeError, pickle.UnpicklingError):
         while True:
             request: Request = pickle.load(sys.stdin.buffer)
             if request.anew:
-                graph = FactorGraph()
+                graph = KeyframeGraph()
             outcome = _outcome(request, graph)
             answers.write(pickle.dumps(Answer(outcome, kept.taken()), pickle.HIGHEST_PROTOCOL))
             answers.flush()
     os._exit(0)  # at once: there is nothing to tidy up
 
 
-def _outcome(request: Request, graph: FactorGraph) -> Any:
+def _outcome(request: Request, graph: KeyframeGraph) -> Any:
     try:
         return request.update(request.subject, graph)
     except Exception as error:

@@ -6,9 +6,10 @@ import logging
 from collections.abc import Callable
 from concurrent.futures import Future
 
-from factorsfm.graph.keyframe_graph import FactorGraph
+from factorsfm.graph.keyframe_graph import KeyframeGraph
 from factorsfm.graph.process import GraphProcess, GraphProcessKilledError
-from factorsfm.mapping.map_update import MapCopy, MapUpdate, update_map
+from factorsfm.mapping.map_copy import MapCopy, MapUpdate
+from factorsfm.mapping.map_update import update_map
 from factorsfm.priors.image_depth import ImageDepth
 
 logger = logging.getLogger(__name__)
@@ -30,7 +31,7 @@ def submit_update(
         if read_depth is not None:
             copy.read_depth(read_depth)
         if len(copy.keyframes) == 1:  # is the world, and no matter of the graph: no need to wait for a process
-            return update_map(copy, FactorGraph())
+            return update_map(copy, KeyframeGraph())
         try:
             return graph.ask(update_map, copy.needed())
         except GraphProcessKilledError as error:

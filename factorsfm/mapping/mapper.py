@@ -16,9 +16,11 @@ from factorsfm.graph.process import GraphProcess
 from factorsfm.mapping.graph_updates import submit_update
 from factorsfm.mapping.incremental import IncrementalMapper
 from factorsfm.mapping.keyframes import carry, is_keyframe
+from factorsfm.mapping.landmarks import add_tracks
 from factorsfm.mapping.live_covariance import live_covariance
+from factorsfm.mapping.map_copy import MapCopy, MapUpdate
 from factorsfm.mapping.map_registration import register_by_corners
-from factorsfm.mapping.map_update import YOUNG_KEYFRAMES, MapCopy, MapUpdate, add_tracks
+from factorsfm.mapping.map_update import YOUNG_KEYFRAMES
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.mapping.point_map import PointMap
 from factorsfm.mapping.registration import Registration

@@ -18,7 +18,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from factorsfm.camera.files import camera_from_json, camera_to_json
-from factorsfm.mapping.map_update import MapUpdate
+from factorsfm.mapping.map_copy import MapUpdate
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.priors.image_depth import ImageDepth
 from factorsfm.streaming.relocalization import KeyframeView

@@ -81,7 +81,7 @@ class MapperOptions:
     keyframe_flow: float = 0.02
     keyframe_interval: int = 12
     landmarks: int = 600
-    graph_iterations: int = 3
+    graph_iterations: int = 1
     graph_delay: int = 3
     pixel_sigma: float = 0.25
     essential_angle_deg: float = 1.0

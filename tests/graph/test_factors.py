@@ -15,16 +15,24 @@ from factorsfm.adjustment.residuals import (
     reprojection,
 )
 from factorsfm.graph.factors import (
+    KERNEL,
     VIRTUAL_BASELINE,
     affine_of_native,
+    affine_prior,
     camera_from_pose,
+    constant_projection_factor,
     depth_consistency_factor,
+    depth_noise,
     image_depth_factor,
     image_reprojection_factor,
+    landmark_prior,
     native_affine,
     native_affine_noise,
     native_depth_factor,
+    pixel_noise,
     pose_from_camera,
+    pose_prior,
+    projection_factor,
     virtual_offset,
 )
 from tests.estimation_problems import rotation_matrices
@@ -343,3 +351,77 @@ def test_native_affine_noise_weighs_scale_and_shift():
         values = gtsam.Values()
         values.insert(A(0), native_affine(scale, shift))
         assert prior.error(values) == pytest.approx(0.5, rel=1e-9)  # one standard deviation away
+
+
+# --- the keyframe graph -----------------------------------------------------------------------------------------
+
+
+@examples
+@given(images(), floats(200, 2000))
+def test_projection_factors_of_free_and_constant_cameras(image, focal):
+    rotation, translation, points, rng = image
+    point, pixels, one = points[0], rng.uniform(-300, 300, 2), np.ones(1)
+    lens, pose, noise = gtsam.Cal3_S2(focal, focal, 0, 0, 0), pose_from_camera(rotation, translation), unit_noise(2)
+    values = gtsam.Values()
+    values.insert(X(0), pose)
+    values.insert(L(0), point)
+    free = projection_factor(pixels, noise, X(0), L(0), lens)
+    constant = constant_projection_factor(gtsam.PinholePoseCal3_S2(pose, lens), pixels, noise, L(0))
+    q = camera_points(rotation, translation, point[None], one)
+    expected, _ = reprojection(q, pixels[None], focal)
+    for factor in (free, constant):
+        np.testing.assert_allclose(factor.whitenedError(values), expected[0], atol=1e-8)
+        assert_gtsam_derivatives(factor, values)
+    np.testing.assert_allclose(jacobians(constant, values)[0], jacobians(free, values)[1], rtol=1e-9, atol=1e-9 * focal)
+
+
+def unit_noise(rows):
+    return gtsam.noiseModel.Unit.Create(rows)
+
+
+@pytest.mark.parametrize("error", [0.1, 1.0, 30.0])
+def test_observations_have_the_cauchy_cost_of_their_noise(error):
+    sigma, focal = 0.4, 500.0
+    lens = gtsam.Cal3_S2(focal, focal, 0, 0, 0)
+    values = gtsam.Values()
+    values.insert(X(0), gtsam.Pose3())
+    values.insert(L(0), np.array([0.2, -0.1, 2.0]))
+    pixels = focal * np.array([0.1, -0.05]) + error * np.array([0.6, 0.8])
+    expected = cauchy(np.array([[error / sigma]]), KERNEL)[0].item()
+    camera = gtsam.PinholePoseCal3_S2(gtsam.Pose3(), lens)
+    assert projection_factor(pixels, pixel_noise(sigma), X(0), L(0), lens).error(values) == pytest.approx(expected)
+    constant = constant_projection_factor(camera, pixels, pixel_noise(sigma), L(0))
+    assert constant.error(values) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("error", [0.01, 0.1, 3.0])
+def test_depths_have_the_cauchy_cost_of_their_noise(error):
+    sigma, values = 0.05, gtsam.Values()
+    values.insert(X(0), gtsam.Pose3())
+    values.insert(T(0), virtual_offset())
+    values.insert(L(0), np.array([0.0, 0.3, 2.0]))
+    values.insert(A(0), native_affine(1.2, 0.1))
+    factor = native_depth_factor(X(0), T(0), L(0), A(0), 1.2 / 2.0 + 0.1 - error, depth_noise(sigma))
+    expected = cauchy(np.array([[error / sigma]]), KERNEL)[0].item()
+    assert factor.error(values) == pytest.approx(expected, rel=1e-6)  # the second row means nothing
+
+
+def test_priors_are_zero_at_their_value_and_one_half_a_deviation_away():
+    pose, point = pose_from_camera(*rotation_matrices([0.1, -0.2, 0.3]), np.array([0.5, -1.0, 2.0])), np.ones(3)
+    affine = native_affine(1.5, 0.2)
+    for factor, key, value, step in (
+        (pose_prior(X(0), pose, 0.3), X(0), pose, 0.3 * np.eye(6)),
+        (landmark_prior(L(0), point, 0.7), L(0), point, 0.7 * np.eye(3)),
+        (
+            affine_prior(A(0), 1.5, 0.2, 0.5, 0.3),
+            A(0),
+            affine,
+            np.array([[0.5 / VIRTUAL_BASELINE, 0, 0, 0, 0], [0, 0, 0, 0.3, 0]]),
+        ),
+    ):
+        values = gtsam.Values()
+        values.insert(key, value)
+        assert factor.error(values) == pytest.approx(0.0, abs=1e-18)
+        for one in step:
+            assert factor.error(moved(values, key, one)) == pytest.approx(0.5, rel=1e-9)
+        assert_gtsam_derivatives(factor, values)

@@ -17,10 +17,11 @@ import numpy as np
 import pytest
 
 from factorsfm.graph import process as graph_process
-from factorsfm.graph.keyframe_graph import FactorGraph
+from factorsfm.graph.keyframe_graph import KeyframeGraph
 from factorsfm.graph.process import GraphProcess, GraphProcessKilledError
 from factorsfm.mapping.graph_updates import submit_update
-from factorsfm.mapping.map_update import MapCopy, update_map
+from factorsfm.mapping.map_copy import MapCopy
+from factorsfm.mapping.map_update import update_map
 from factorsfm.mapping.point_map import PointMap
 from factorsfm.support.errors import FactorsfmError
 from factorsfm.support.options import MapperOptions
@@ -91,7 +92,7 @@ def wait_until(true, seconds=20.0):
 
 
 def test_updates_are_those_of_a_graph_in_this_process(graph, shot):
-    here = FactorGraph()
+    here = KeyframeGraph()
     for keyframes in (1, 2, 5, 8):
         update = submit_update(graph, shot.copy(keyframes), None).result()
         assert update.committed
@@ -99,16 +100,16 @@ def test_updates_are_those_of_a_graph_in_this_process(graph, shot):
 
 
 def test_what_is_left_out_of_a_request_makes_no_difference(graph):
-    shot = Shot(frames=34)
+    shot = Shot(frames=30)
     for k, image in enumerate(shot.images[:14]):  # the constant ones that share most, and one that shares too little
         seen = len(image.tracks.ids) - 5 * k if k != 6 else 10
         image.tracks = replace(image.tracks.of(image.tracks.ids < seen), depth=None)
     shot.points.set(5000 + np.arange(100), np.ones((100, 3)))  # what none of these keyframes sees
-    assert len(shot.copy(34).needed().keyframes) == 28
-    update = submit_update(graph, shot.copy(34), None).result()
+    assert len(shot.copy(30).needed().keyframes) == 24
+    update = submit_update(graph, shot.copy(30), None).result()
     assert update.committed
     with OneThreadEach():  # more of them add in another order
-        assert_equal(update, update_map(shot.copy(34), FactorGraph()))
+        assert_equal(update, update_map(shot.copy(30), KeyframeGraph()))
 
 
 def test_requests_do_not_grow_with_the_shot():
@@ -162,7 +163,7 @@ def test_what_is_logged_there_is_logged_here(graph, shot, caplog):
 def test_another_map_begins_with_an_empty_graph(graph, shot):
     submit_update(graph, shot.copy(8), None).result()
     graph.start_anew()
-    assert_equal(submit_update(graph, shot.copy(4), None).result(), update_map(shot.copy(4), FactorGraph()))
+    assert_equal(submit_update(graph, shot.copy(4), None).result(), update_map(shot.copy(4), KeyframeGraph()))
 
 
 # --- the process ------------------------------------------------------------------------------------------------
@@ -200,7 +201,7 @@ def test_killed_in_the_middle_of_an_update(graph, shot, caplog):
     assert caplog.messages == [f"update at frame 4 rolled back: {reason}"]
     assert has_ended(pid)
     # The graph comes back from the map.
-    assert_equal(submit_update(graph, shot.copy(6), None).result(), update_map(shot.copy(6), FactorGraph()))
+    assert_equal(submit_update(graph, shot.copy(6), None).result(), update_map(shot.copy(6), KeyframeGraph()))
     assert pid_of(graph) != pid
 
 
@@ -231,7 +232,7 @@ def test_a_process_that_does_not_answer_as_it_should_is_not_used_again(graph, sh
         graph.ask(update, None)
     monkeypatch.undo()
     assert has_ended(pid)
-    assert_equal(submit_update(graph, shot.copy(4), None).result(), update_map(shot.copy(4), FactorGraph()))
+    assert_equal(submit_update(graph, shot.copy(4), None).result(), update_map(shot.copy(4), KeyframeGraph()))
     assert pid_of(graph) != pid
 
 

@@ -5,7 +5,7 @@ import time
 from typing import Any
 
 from factorsfm.graph import server
-from factorsfm.graph.keyframe_graph import FactorGraph
+from factorsfm.graph.keyframe_graph import KeyframeGraph
 
 
 class Torn:
@@ -15,27 +15,27 @@ class Torn:
         return int, ("torn",)
 
 
-def echo(subject: Any, graph: FactorGraph) -> Any:
+def echo(subject: Any, graph: KeyframeGraph) -> Any:
     return subject
 
 
-def pid(subject: Any, graph: FactorGraph) -> int:
+def pid(subject: Any, graph: KeyframeGraph) -> int:
     return os.getpid()
 
 
-def slow_echo(subject: Any, graph: FactorGraph) -> Any:
+def slow_echo(subject: Any, graph: KeyframeGraph) -> Any:
     time.sleep(1.0)
     return subject
 
 
-def never(subject: Any, graph: FactorGraph) -> None:
+def never(subject: Any, graph: KeyframeGraph) -> None:
     time.sleep(1000.0)
 
 
-def torn(subject: Any, graph: FactorGraph) -> Torn:
+def torn(subject: Any, graph: KeyframeGraph) -> Torn:
     return Torn()
 
 
-def no_answer(subject: Any, graph: FactorGraph) -> None:
+def no_answer(subject: Any, graph: KeyframeGraph) -> None:
     """Instead of its answer the process sends a word."""
     server.Answer = lambda outcome, log: "hello"

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factorsfm.graph.keyframe_graph import FactorGraph
-from factorsfm.mapping.map_update import MapCopy, update_map
+from factorsfm.graph.keyframe_graph import KeyframeGraph
+from factorsfm.mapping.map_copy import MapCopy
+from factorsfm.mapping.map_update import update_map
 from factorsfm.mapping.point_map import PointMap
 from factorsfm.mapping.prior_check import inconsistency
 from factorsfm.support.options import MapperOptions
@@ -64,8 +65,8 @@ def test_an_update_of_a_young_map_tells_that_the_prior_is_none(graph_depth):
     problem, images = keyframes(8, shuffled=range(8))
     points, options = PointMap(), MapperOptions(landmarks=200, graph_depth=graph_depth)
     points.set(np.arange(len(problem.points)), problem.points)
-    update = update_map(MapCopy(images[:5], points, options, problem.focal), FactorGraph())
+    update = update_map(MapCopy(images[:5], points, options, problem.focal), KeyframeGraph())
     assert update.no_prior is graph_depth
     assert update.committed is not graph_depth
     assert ("correlates" in update.reason) is graph_depth
-    assert not update_map(MapCopy(images, points, options, problem.focal), FactorGraph()).no_prior  # no longer young
+    assert not update_map(MapCopy(images, points, options, problem.focal), KeyframeGraph()).no_prior  # no longer young

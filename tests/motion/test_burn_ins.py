@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from factorsfm.adjustment.observations import Observations
-from factorsfm.graph.keyframe_graph import FactorGraph
-from factorsfm.mapping.map_update import MapCopy, update_map
+from factorsfm.graph.keyframe_graph import KeyframeGraph
+from factorsfm.mapping.map_copy import MapCopy
+from factorsfm.mapping.map_update import update_map
 from factorsfm.mapping.point_map import PointMap
 from factorsfm.motion.burn_ins import resting
 from factorsfm.polish.camera_starts import converge_cameras
@@ -77,7 +78,7 @@ def test_the_map_takes_captions_out_at_once(motion, found):
     far = np.where(np.arange(len(problem.points)) < scene, 1.0, 30.0)[:, None]
     points.set(np.arange(len(problem.points)), problem.points * far)
     keyframes = [images[k] for k in (0, 3, 6, 9)]
-    update = update_map(MapCopy(keyframes, points, MapperOptions(), problem.focal), FactorGraph())
+    update = update_map(MapCopy(keyframes, points, MapperOptions(), problem.focal), KeyframeGraph())
     assert update.committed
     captions = np.arange(scene, len(problem.points)) if found else np.zeros(0, np.int64)
     np.testing.assert_array_equal(update.burn_ins, captions)

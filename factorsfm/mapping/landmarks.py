@@ -1,0 +1,114 @@
+"""Landmarks of the map: which tracks become one, and the points that the graph leaves out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
+from factorsfm.adjustment.gather import gather
+from factorsfm.adjustment.problem import ErrorModel, Free
+from factorsfm.mapping.depth_fallback import DepthGuidance
+from factorsfm.mapping.incremental import add_points, triangulate_tracks
+from factorsfm.mapping.map_copy import MapCopy, MapUpdate
+from factorsfm.mapping.mapped_images import MappedImage, state_of
+from factorsfm.mapping.point_map import PointMap
+from factorsfm.support.options import MapperOptions, PolishOptions
+from factorsfm.tracks.image_tracks import seen_by
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+_GROSS = 4.0  # times the threshold of an inlier: a young map is wrong, too, and long tracks are precious
+_FARTHEST = 1e-6  # smallest inverse distance of a point
+_ALONE_ITERATIONS = 4
+_SOLVER = replace(PolishOptions(), tolerance=1e-3)
+
+
+def mapped_landmarks(window: Sequence[MappedImage], points: PointMap) -> Index:
+    """Mapped tracks that two keyframes of the window see."""
+    ids = seen_by([image.tracks for image in window], 2)
+    return ids[points.contains(ids)]
+
+
+def add_landmarks(copy: MapCopy, window: list[MappedImage], guidance: DepthGuidance) -> None:
+    """Tracks of the new keyframe that become landmarks: well spread, triangulated from the keyframes that see them."""
+    o, newest = copy.options, window[-1]
+    known = copy.points.contains(newest.tracks.ids)
+    seen = np.concatenate([image.tracks.ids for image in window[:-1]])
+    candidates = ~known & np.isin(newest.tracks.ids, seen)
+    room = o.landmarks - int(known.sum())
+    if room < o.landmarks // 10 or not candidates.any():
+        return
+    chosen = _spread(newest.tracks.xy, known, np.nonzero(candidates)[0], room)
+    _add_points(copy.points, window, newest, np.sort(newest.tracks.ids[chosen]), guidance, copy.focal)
+
+
+def add_tracks(
+    points: PointMap, images: Sequence[MappedImage], near: MappedImage, ids: Index, options: MapperOptions, focal: float
+) -> int:
+    """Points for tracks that registered images see, keyframes or not, until the graph knows better; their number.
+
+    Args:
+        points: the map to which they are added.
+        images: registered; near: one of them; ids: those of its tracks that are wanted.
+        focal: pixels.
+    """
+    ids = np.intersect1d(ids, seen_by([image.tracks for image in images], 2))
+    ids = ids[~points.contains(ids)]
+    return _add_points(points, images, near, ids, DepthGuidance(options, points), focal) if len(ids) else 0
+
+
+def _add_points(
+    points: PointMap,
+    images: Sequence[MappedImage],
+    near: MappedImage,
+    ids: Index,
+    guidance: DepthGuidance,
+    focal: float,
+) -> int:
+    """Triangulate tracks of `near` (ascending) from all images, and add what they agree on to the map."""
+    found = triangulate_tracks(
+        images, ids, guidance,
+        focal=focal, inlier_px=guidance.options.inlier_px, fallback=guidance.fallback(near, ids),
+    )  # fmt: skip
+    return add_points(points, ids, found, (found.inliers >= 2) & (found.inverse_distance > _FARTHEST))
+
+
+def _spread(xy: Array, taken: NDArray[np.bool_], candidates: NDArray[np.intp], count: int) -> NDArray[np.intp]:
+    """`count` of the candidates, taken in turn from the emptiest cells of a grid; older tracks come first."""
+    cell = np.floor((xy - xy.min(0)) / np.maximum(np.ptp(xy, axis=0), 1e-9) * [15.99, 8.99]).astype(int)
+    key = cell[:, 0] * 9 + cell[:, 1]
+    load = np.bincount(key[taken], minlength=144)
+    order = candidates[np.argsort(key[candidates], kind="stable")]
+    first = np.searchsorted(key[order], np.arange(144))
+    rank = np.arange(len(order)) - first[key[order]] + load[key[order]]
+    return np.asarray(order[np.argsort(rank, kind="stable")[:count]])
+
+
+def solve_alone(
+    copy: MapCopy, images: list[MappedImage], update: MapUpdate, ids: Index, guidance: DepthGuidance
+) -> MapUpdate:
+    """The update with further points, each solved alone with the poses of the update."""
+    moved = [replace(image) for image in images]
+    for image in moved:
+        position = image.tracks.position
+        image.rotation, image.translation = update.poses.get(position, image.pose)
+        image.affine = update.affines.get(position, image.affine)
+    affine, prior = guidance.at_observations(moved, ids)
+    state = state_of(moved, copy.points.at(ids), copy.focal)
+    if affine is not None:
+        state = replace(state, scale=affine[:, 0], shift=affine[:, 1], field=np.zeros(1))
+    alone = BundleAdjustment(
+        state, gather([image.tracks for image in moved], ids), _SOLVER,
+        ErrorModel(copy.options.pixel_sigma), prior=prior, free=Free(cameras=False),
+    )  # fmt: skip
+    state = alone.solve(_ALONE_ITERATIONS)
+    errors = np.sqrt(alone.observations.mean_by_point(alone.reprojection_errors() ** 2))
+    good = (state.inverse_distance > _FARTHEST) & (errors < _GROSS * copy.options.inlier_px)
+    every, points = np.concatenate([update.ids, ids[good]]), np.concatenate([update.points, state.points[good]])
+    order = np.argsort(every)
+    return replace(update, ids=every[order], points=points[order], removed=np.union1d(update.removed, ids[~good]))

@@ -1,0 +1,87 @@
+"""What an update of the map starts from, and what it gives: copies that cross to another process."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorsfm.mapping.graph_window import taking_part
+from factorsfm.mapping.mapped_images import MappedImage
+from factorsfm.mapping.point_map import PointMap
+from factorsfm.priors.image_depth import ImageDepth
+from factorsfm.support.options import MapperOptions
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class MapUpdate:
+    """Result of an update.
+
+    Attributes:
+        position: of the new keyframe; depth: its prior.
+        committed, reason: whether the map may take it over, and why not.
+        ids, points: moved and new points; removed: points that no longer hold.
+        poses, affines, covariances: of the keyframes that moved, by position.
+        focal: a better focal length (pixels), None where it stays as it is.
+        burn_ins: tracks of what is laid over the images.
+        mirrored: see `UpdateResult`.
+        no_prior: whether the keyframes show that the depth prior is none; `reason` says why.
+    """
+
+    position: int
+    depth: ImageDepth | None
+    committed: bool
+    reason: str
+    ids: Index = field(default_factory=lambda: np.zeros(0, np.int64))
+    points: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    removed: Index = field(default_factory=lambda: np.zeros(0, np.int64))
+    poses: dict[int, tuple[Array, Array]] = field(default_factory=dict)
+    affines: dict[int, tuple[float, float]] = field(default_factory=dict)
+    covariances: dict[int, Array] = field(default_factory=dict)
+    focal: float | None = None
+    burn_ins: Index = field(default_factory=lambda: np.zeros(0, np.int64))
+    mirrored: bool = False
+    no_prior: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class MapCopy:
+    """What an update starts from: copies that nobody else changes.
+
+    Attributes:
+        keyframes: in order of time, the new one last.
+        focal: pixels; refine_focal: whether it is a guess.
+    """
+
+    keyframes: list[MappedImage]
+    points: PointMap
+    options: MapperOptions
+    focal: float
+    refine_focal: bool = False
+
+    @property
+    def newest(self) -> MappedImage:
+        """The new keyframe."""
+        return self.keyframes[-1]
+
+    def read_depth(self, read: Callable[[], ImageDepth | None]) -> None:
+        """Give the new keyframe its prior, unless it has one."""
+        if self.newest.tracks.depth is None:
+            self.newest.tracks = replace(self.newest.tracks, depth=read())
+
+    def without_prior(self) -> MapCopy:
+        """The same as if there were no prior."""
+        bare = [replace(image, tracks=replace(image.tracks, depth=None)) for image in self.keyframes]
+        return replace(self, keyframes=bare)
+
+    def needed(self) -> MapCopy:
+        """As much of it as makes a difference to an update, which does not grow with the length of the shot."""
+        before, free = taking_part(self.keyframes)
+        keyframes = before + free
+        points = self.points.part(np.concatenate([image.tracks.ids for image in keyframes]))
+        return replace(self, keyframes=keyframes, points=points)
