@@ -11,6 +11,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+import factorsfm
 from factorsfm import (
     ExportOptions,
     Frame,
@@ -110,6 +111,36 @@ def test_without_noise_the_solution_is_exact() -> None:
     ring = Ring(cameras=8, points=600)
     result = solve(ring.tracks(noise_px=0.0))
     assert ring.errors(result.state.rotation, result.state.translation).ate.max() < 1e-6
+
+
+def with_depth(ring: Ring, tracks: list[ImageTracks], scale: float, shift: float) -> list[ImageTracks]:
+    """The tracks with a depth prior: the true depth is ``scale * D + shift`` of the prior's."""
+    guided = []
+    for image in tracks:
+        points = ring.points[np.isin(ring.ids, image.ids)]
+        k = image.position
+        depth = ((points @ ring.rotation[k].T + ring.translation[k])[:, 2] - shift) / scale
+        guided.append(replace(image, depth=ImageDepth(1.0 / depth, np.ones(len(depth)), 1.0)))
+    return guided
+
+
+@pytest.mark.parametrize("preset", ["paper", "paper-init-only"])
+def test_the_papers_steps_use_depth_on_a_set(preset: str) -> None:
+    """Registration finds gamma and beta, triangulation holds points to them (paper, equations 2 to 4)."""
+    ring = Ring(cameras=5, points=600)
+    tracks = with_depth(ring, ring.tracks(noise_px=0.3), scale=2.0, shift=0.5)
+    mapper = SetMapper(tracks, FOCAL, for_image_sets(factorsfm.PRESETS[preset]))
+    mapper.run()
+    assert registered(mapper) == list(range(5))
+    affines = [image.affine for image in mapper.images if image.affine is not None]
+    if preset == "paper-init-only":
+        assert not affines
+        return
+    assert len(affines) == 5
+    # In a map u times as large as the truth gamma is 2 u and beta 0.5 u, whatever u is.
+    gamma, beta = np.array(affines).T
+    np.testing.assert_allclose(gamma, gamma.mean(), rtol=2e-3)
+    np.testing.assert_allclose(beta / gamma, 0.25, atol=0.01)
 
 
 def test_an_image_that_the_map_contradicts_is_registered_again() -> None:
