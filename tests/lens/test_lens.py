@@ -105,9 +105,9 @@ def test_the_gradient_of_the_lens_columns_is_that_of_the_cost(kernel, group):
         return (costs[0] - costs[1]) / 2e-6
 
     expected = np.array([slope(column) for column in range(size)])
-    assert (np.abs(expected[lens:]) > 1e-3).all()  # every column takes part
+    assert (np.abs(expected[lens:]) > 1.0).all()  # every column takes part
     np.testing.assert_allclose(
-        normal.camera_gradient, expected, rtol=1e-5, atol=1e-5 * np.abs(expected).max()
+        normal.camera_gradient, expected, rtol=1e-8, atol=1e-8 * np.abs(expected).max()
     )  # fmt: skip
 
 
@@ -136,8 +136,8 @@ def test_the_lenses_of_several_cameras_are_found():
     result = polish(images, points, wrong.focal, options, groups=groups)
     assert result.lens.determined
     error = np.log(result.lens.lens.focal / problem.focal)
-    assert 1e-7 < np.abs(error).max() < 0.01
-    assert (np.abs(error) < 5 * result.lens.focal_std).all()
+    assert 3e-4 < np.abs(error).max() < 2e-3
+    assert (np.abs(error) < 2 * result.lens.focal_std).all()
     np.testing.assert_array_equal(result.state.group, groups)
 
 
@@ -147,8 +147,8 @@ def test_the_focal_length_is_found_from_a_wrong_guess(guess):
     result = estimated(problem, guess=guess)
     error = result.lens.lens.focal[0] / problem.focal - 1
     assert result.lens.determined
-    assert 1e-7 < abs(error) < 0.03
-    assert 1e-5 < result.lens.focal_std < DETERMINED_FOCAL_STD
+    assert 3e-4 < abs(error) < 2e-3
+    assert 1e-3 < result.lens.focal_std < 6e-3 < DETERMINED_FOCAL_STD
     assert not result.lens.lens.shape.any()
 
 
@@ -166,7 +166,7 @@ def test_the_standard_deviation_is_consistent_with_the_error():
         found = estimated(problem, guess=1.2, lens="focal").lens
         assert found.determined
         results.append(np.log(found.lens.focal[0] / problem.focal) / found.focal_std[0])
-    assert 0.3 < np.sqrt(np.mean(np.square(results))) < 1.7
+    assert 0.4 < np.sqrt(np.mean(np.square(results))) < 1.0
 
 
 def test_a_distortion_that_is_not_believed_makes_the_focal_length_less_certain():
@@ -180,7 +180,7 @@ def test_a_distortion_that_is_not_believed_makes_the_focal_length_less_certain()
             assert not found.lens.shape.any()
             off[lens].append(np.log(found.lens.focal[0] / problem.focal) / found.focal_std[0])
     conditional, joint = (np.sqrt(np.mean(np.square(off[lens]))) for lens in ("focal", "distortion"))
-    assert 0.1 < joint < 1.7
+    assert 0.5 < joint < 1.2
     assert conditional > 1.3 * joint
 
 
@@ -197,7 +197,7 @@ def test_errors_as_long_as_a_track_lives_count_once():
         )  # fmt: skip
         std = np.sqrt(max(c[0, 0] for c in lens_covariances(adjustment)))
         off.append((adjustment.state.log_focal[0] - np.log(problem.focal)) / std)
-    assert 0.3 < np.sqrt(np.mean(np.square(off))) < 2.0
+    assert 0.35 < np.sqrt(np.mean(np.square(off))) < 0.9
 
 
 def test_what_is_left_out_tells_as_much_as_independent_errors_do():
@@ -209,7 +209,7 @@ def test_what_is_left_out_tells_as_much_as_independent_errors_do():
         )  # fmt: skip
         errors.append(solved.state.log_focal[0] - np.log(problem.focal))
         said.append(np.sqrt(_left_out_covariance(solved)[0, 0] / lens_covariances(solved)[0][0, 0]))
-    assert 0.7 < np.median(said) < 1.6
+    assert 0.8 < np.median(said) < 1.4
 
 
 def test_what_is_left_out_shows_that_parts_of_the_shot_disagree():
@@ -227,8 +227,8 @@ def test_what_is_left_out_shows_that_parts_of_the_shot_disagree():
         off["within"].append(error / np.sqrt(max(c[0, 0] for c in lens_covariances(solved))))
         off["left out"].append(error / np.sqrt(_left_out_covariance(solved)[0, 0]))
     within, left_out = (np.sqrt(np.mean(np.square(off[key]))) for key in ("within", "left out"))
-    assert 0.3 < left_out < 1.7
-    assert within > 1.3 * left_out
+    assert 0.6 < left_out < 1.6
+    assert within > 3.0 * left_out
 
 
 def test_the_tracks_of_an_unknown_lens_show_all_parts_of_the_image():
@@ -253,7 +253,7 @@ def test_tiny_motion_or_none_but_along_the_view_axis_keeps_the_guess(motion, par
     assert not result.lens.determined
     assert not result.lens.rough
     assert np.exp(result.state.log_focal) == pytest.approx(1.2 * problem.focal)
-    assert result.lens.focal_std > DETERMINED_FOCAL_STD
+    assert result.lens.focal_std > 0.4 > DETERMINED_FOCAL_STD
 
 
 @pytest.mark.parametrize("first_std", [0.02, 0.06, 0.3])
@@ -283,7 +283,7 @@ def test_a_translation_that_is_none_does_not_bend_with_the_lens(motion, parallax
     )  # fmt: skip
     assert moves == (motion == "arc")
     assert solved.state.translation.any() == moves
-    np.testing.assert_allclose(solved.state.lens, BARREL, atol=0.02)
+    np.testing.assert_allclose(solved.state.lens, BARREL, atol=0.004)
     assert np.exp(solved.state.log_focal) == pytest.approx(problem.focal, rel=0.01)
 
 
@@ -301,11 +301,11 @@ def test_distortion_is_recovered_over_the_image(lens):
     shape = BARREL if lens == "distortion" else BARREL + [0, 0, 0.01, -0.008, 0, 0]
     found = estimated(problem, guess=1.2, shape=shape, lens=lens).lens
     assert found.determined
-    assert (found.shape_std[:2] < 0.05).all()
+    assert 1e-3 < found.shape_std[:2].max() < 0.012
     xy = problem.observations.xy
     truth = problem.focal * distort(xy, shape)[0]
     off = np.linalg.norm(found.lens.focal * distort(xy, found.lens.shape)[0] - truth, axis=1)
-    assert 1e-4 < np.percentile(off, 99) < (0.5 if lens == "distortion" else 1.5)
+    assert 0.2 < np.percentile(off, 99) < (0.5 if lens == "distortion" else 1.5)
 
 
 @pytest.mark.parametrize("guess", [0.8, 1.3])
@@ -316,7 +316,7 @@ def test_strong_distortion_is_found_with_the_focal_length(motion, parallax, gues
     assert (result.motion.kind is ShotKind.ROTATION) == (motion == "rotation")
     assert result.lens.determined
     error = np.log(result.lens.lens.focal[0] / problem.focal)
-    assert 1e-7 < abs(error) < min(0.01, 3 * result.lens.focal_std[0])
+    assert 5e-4 < abs(error) < min(0.005, 3 * result.lens.focal_std[0])
     np.testing.assert_allclose(result.lens.lens.shape, STRONG_BARREL, atol=0.02)
 
 
@@ -344,7 +344,7 @@ def test_distortion_alone_is_recovered_and_the_focal_length_stays_as_given():
     assert lens_note(found).startswith("The focal length is as it was given; radial distortion k1 -0.1")
     xy = problem.observations.xy
     off = problem.focal * np.linalg.norm(distort(xy, found.lens.shape)[0] - distort(xy, BARREL)[0], axis=1)
-    assert 1e-4 < np.percentile(off, 99) < 0.3
+    assert 0.1 < np.percentile(off, 99) < 0.3
     straight = estimated(problem, guess=1.0, lens="radial").lens
     assert lens_note(straight) == "The focal length is as it was given; no distortion was found."
     assert not straight.lens.shape.any()

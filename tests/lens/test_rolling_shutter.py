@@ -100,7 +100,7 @@ def test_the_readout_is_found_and_poses_are_those_of_the_middle(readout, along):
     assert found.shutter is not None
     assert found.shutter.readout[index] == pytest.approx(readout, abs=max(0.01, 3 * found.shutter.std))
     assert found.shutter.readout[1 - index] == 0.0
-    assert 1e-4 < found.shutter.std < 0.02
+    assert 0.002 < found.shutter.std < 0.015
     assert 0.8 < found.sigma / problem.noise_px < 1.2
     angle, away = wrong_by(found, problem)
     ignored_angle, ignored_away = wrong_by(ignored, problem)
@@ -137,7 +137,7 @@ def test_an_unknown_focal_length_is_found_beside_the_readout():
     assert found.lens.guess.shape[READOUT].tolist() == [0.0, 0.0]
     ignored = polished(problem, lens="focal", guess=1.2, shutter="global").lens
     off = abs(ignored.lens.focal[0] / problem.focal - 1)
-    assert off > 0.01 or not ignored.determined
+    assert off > 0.1
 
 
 def test_poses_of_the_recorded_images_show_the_points_where_the_images_do():
@@ -182,7 +182,7 @@ def test_frames_between_are_of_the_same_moment_as_the_others():
     problem = handheld()
     few = polished(problem, max_frames=20)
     assert few.frames == list(range(48))
-    assert few.shutter.readout[1] == pytest.approx(0.9, abs=0.03)
+    assert few.shutter.readout[1] == pytest.approx(0.9, abs=0.008)
     assert wrong_by(few, problem)[0] < 0.03
     recorded = polished(problem, max_frames=20, shutter="auto")
     exact = handheld_polished("auto")
@@ -216,18 +216,19 @@ def test_errors_of_the_tracks_are_no_readout():
         assert polished(problem).shutter is None
 
 
-@pytest.mark.parametrize("lens", ["fixed", "focal"])
-def test_a_camera_that_turns_does_not_seem_to_move(lens):
+@pytest.mark.parametrize(("lens", "guess", "focals"), [("fixed", 1.0, 0), ("focal", 1.2, 1)])
+def test_a_camera_that_turns_does_not_seem_to_move(lens, guess, focals):
     problem = rolling_problem("rotation", 0.9)
-    found = polished(problem, lens=lens, guess=1.0 if lens == "fixed" else 1.2)
+    found = polished(problem, lens=lens, guess=guess)
     recorded = polished(problem, shutter="auto")
     assert polished(problem, shutter="global").motion.kind is ShotKind.GENERAL
     for result in (found, recorded):
         assert result.motion.kind is ShotKind.ROTATION
         assert not result.state.translation.any()
         assert result.shutter.readout[1] == pytest.approx(0.9, abs=0.03)
-    assert 1e-4 < wrong_by(found, problem)[0] < 0.01
-    assert found.lens is None or found.lens.lens.focal[0] == pytest.approx(problem.focal, rel=0.003)
+    assert 0.002 < wrong_by(found, problem)[0] < 0.01
+    estimated = [] if found.lens is None else found.lens.lens.focal.tolist()
+    assert estimated == pytest.approx(focals * [problem.focal], rel=1e-4)
 
 
 @pytest.mark.parametrize(

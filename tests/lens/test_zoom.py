@@ -45,9 +45,9 @@ def test_a_zoom_is_followed_in_every_frame(motion, parallax, zoom):
     problem, result = polished(motion, zoom, parallax=parallax)
     error = np.log(result.state.focal / (problem.focal * profile(zoom)))
     assert result.lens.determined
-    assert 1e-7 < np.abs(error).max() < 0.02
-    assert (result.lens.focal_std < DETERMINED_FOCAL_STD).all()
-    assert angles_between(result.state.rotation, problem.truth.rotation).max() < 2e-3
+    assert 5e-5 < np.abs(error).max() < 2e-3
+    assert 8e-4 < result.lens.focal_std.max() < 5e-3 < DETERMINED_FOCAL_STD
+    assert 4e-5 < angles_between(result.state.rotation, problem.truth.rotation).max() < 3e-4
     assert result.motion.kind is (ShotKind.ROTATION if motion == "rotation" else ShotKind.GENERAL)
 
 
@@ -55,8 +55,8 @@ def test_the_course_of_a_zoom_is_known_where_the_focal_length_is_not():
     _, result = polished("static", 1.4, parallax=0.0)
     assert not result.lens.determined
     course = result.state.focal / result.state.focal[0]
-    np.testing.assert_allclose(course, profile(1.4), rtol=2e-3)
-    assert 1e-6 < result.lens.zoom_std < 1e-3
+    np.testing.assert_allclose(course, profile(1.4), rtol=1e-4)
+    assert 1e-5 < result.lens.zoom_std < 1e-4
     assert result.motion.kind is ShotKind.STATIC
 
 
@@ -64,15 +64,15 @@ def test_no_zoom_is_found_where_there_is_none():
     problem, result = polished("arc", 1.0, parallax=0.3)
     assert len(result.state.log_focal) == 1
     assert result.lens.determined
-    assert 1e-6 < result.lens.zoom_std < 0.01
-    assert result.state.focal[0] == pytest.approx(problem.focal, rel=0.02)
+    assert 1e-4 < result.lens.zoom_std < 1e-3
+    assert result.state.focal[0] == pytest.approx(problem.focal, rel=0.0015)
 
 
 def test_frames_between_the_solved_ones_have_the_focal_length_between():
     problem, result = polished("rotation", 1.4, parallax=0.0, max_frames=8)
     assert result.frames == list(range(FRAMES))
     np.testing.assert_allclose(result.state.focal, problem.focal * profile(1.4), rtol=0.01)
-    assert np.median(result.errors) < 1.0
+    assert 0.03 < np.median(result.errors) < 0.16
 
 
 @pytest.fixture(scope="module")
@@ -93,13 +93,12 @@ def test_a_rendered_zoom_is_followed(shot, reconstruction):
     assert len(reconstruction.registered) == 24
     focals = np.array([reconstruction.camera_of(frame).mean_focal_length() for frame in reconstruction.frames])
     course = focals / focals[0]
-    assert 1e-6 < np.abs(course / shot.zoom - 1).max() < 0.02
-    if reconstruction.lens.determined:
-        assert np.abs(focals / (shot.camera.focal_length_x * shot.zoom) - 1).max() < 0.02
-    assert reconstruction.lens.zoom_std < 0.005
+    assert 5e-4 < np.abs(course / shot.zoom - 1).max() < 0.004
+    assert not reconstruction.lens.determined  # only its course
+    assert 2e-4 < reconstruction.lens.zoom_std < 1.5e-3
     assert focal_range(reconstruction) == pytest.approx((focals.min(), focals.max()))
     assert any("changes from" in note for note in reconstruction.notes)
-    assert 0 < errors_of(reconstruction, shot).r_rpe.max() < 1.0
+    assert 0.015 < errors_of(reconstruction, shot).r_rpe.max() < 0.12
 
 
 def test_a_zoom_survives_its_files(reconstruction, tmp_path):
@@ -110,6 +109,6 @@ def test_a_zoom_survives_its_files(reconstruction, tmp_path):
         assert after.focal_std == before.focal_std
     np.testing.assert_allclose(back.camera.params, reconstruction.camera.params)
     np.testing.assert_allclose(
-        np.median(back.observation_error), np.median(reconstruction.observation_error), rtol=0.05
+        np.median(back.observation_error), np.median(reconstruction.observation_error), rtol=1e-5
     )
     assert summary(back)["focal_range"] == pytest.approx(summary(reconstruction)["focal_range"])
