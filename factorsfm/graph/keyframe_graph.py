@@ -105,6 +105,10 @@ class KeyframeGraph:
                 reason = f"the linear system of the update is indeterminate ({message})"
         return _rolled_back(window, reason)
 
+    def contents(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+        """A copy of the factors, and the estimate."""
+        return self._live.contents()
+
 
 class _Live:
     """iSAM2 with the slots of its factors."""
@@ -304,6 +308,14 @@ class _Live:
                     scale[row], shift[row] = affine_of_native(estimate.atCal3_S2(A(position)))
             depths = replace(depths, scale=scale, shift=shift)
         return replace(window, rotation=rotation, translation=translation, points=points, depths=depths)
+
+    def contents(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+        """A copy of the factors, and the estimate."""
+        slots, graph = self._isam.getFactorsUnsafe(), gtsam.NonlinearFactorGraph()
+        for slot in range(slots.size()):
+            if slots.exists(slot):
+                graph.add(slots.at(slot))
+        return graph, self._isam.calculateEstimate()
 
     def covariances(self, window: Window) -> dict[int, Array]:
         """(6, 6) of each pose that is solved for, by position."""

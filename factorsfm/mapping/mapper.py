@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.graph.contents import LiveGraph, graph_contents
 from factorsfm.graph.process import GraphProcess
 from factorsfm.mapping.graph_updates import submit_update
 from factorsfm.mapping.incremental import IncrementalMapper
@@ -109,11 +110,14 @@ class Mapper(IncrementalMapper):
 
     # --- the algorithm ------------------------------------------------------------------------------------------
 
-    def add(self, tracks: ImageTracks, read_depth: Callable[[], ImageDepth | None]) -> MappedImage:
+    def add(
+        self, tracks: ImageTracks, read_depth: Callable[[], ImageDepth | None], *, keyframe: bool = False
+    ) -> MappedImage:
         """Take the next image: register it on the map, and extend the map where it shows something new.
 
         Args:
             read_depth: gives the prior at the image's keypoints; called only if it is needed.
+            keyframe: whether it becomes a keyframe also where it shows nothing new, if it is registered.
         """
         if self._reads_every_depth:
             tracks = replace(tracks, depth=read_depth())
@@ -122,6 +126,10 @@ class Mapper(IncrementalMapper):
         self.images.append(image)
         try:
             self._process(image, read_depth)
+            if keyframe and image.registered and not image.keyframe:
+                self._take_over()
+                if image.registered:  # on a map that was not given up
+                    self._add_keyframe(image, read_depth)
         except Exception:  # a prior that fails, before anything changed: the image was never here
             self.images.pop()
             raise
@@ -174,6 +182,10 @@ class Mapper(IncrementalMapper):
         self.refresh()
         self._take_up_lost()
         self.close()
+
+    def graph(self) -> LiveGraph:
+        """A copy of the keyframe graph as the last update left it, empty before the first one."""
+        return graph_contents(self._graph)
 
     def close(self) -> None:
         """Let the graph go; what it is working on is lost."""

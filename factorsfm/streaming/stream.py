@@ -20,6 +20,7 @@ from factorsfm.camera.guess import guess_camera
 from factorsfm.control.known import Control
 from factorsfm.frames.frame import Frame, as_frame
 from factorsfm.frames.texture import BLANK_TEXTURE
+from factorsfm.graph.contents import LiveGraph, empty_graph
 from factorsfm.graph.process import GraphProcess
 from factorsfm.lens.camera_model import distortion_of
 from factorsfm.mapping.mapper import Mapper
@@ -95,11 +96,12 @@ class Stream(Closing):
         self._colors = TrackColors()
         self._without_depth: dict[int, str] = {}  # why the prior failed, by the frame's index
 
-    def push(self, frame: Frame | NDArray[np.uint8]) -> FrameUpdate:
+    def push(self, frame: Frame | NDArray[np.uint8], *, keyframe: bool = False) -> FrameUpdate:
         """Take the next frame.
 
         Args:
             frame: a `Frame`, or an image (h, w, 3) BGR or (h, w) grey.
+            keyframe: make it a keyframe, where it is registered: the caller has a measurement of its pose.
 
         Raises:
             InputError: it is no image, its size differs from that of the frames before or contradicts the camera, or
@@ -128,7 +130,7 @@ class Stream(Closing):
         tracks = ImageTracks(len(self.frames), tracked.ids, tracked.xy, self.camera)
         tracks = tracks.of(tracks.invertible & (tracked.texture >= BLANK_TEXTURE))  # a blank image's tracks are noise
         with self.seconds.of("mapping"):
-            image = mapper.add(tracks, lambda: self._read_depth(frame, tracks.pixels))
+            image = mapper.add(tracks, lambda: self._read_depth(frame, tracks.pixels), keyframe=keyframe)
         focal_changed |= self._follow_focal(mapper)
         self.frames.append(SeenFrame(frame.index, frame.name, frame.timestamp, tracked.texture))
         self._thumbnails.add(frame.image)
@@ -150,6 +152,15 @@ class Stream(Closing):
             return []
         self._mapper.refresh()
         return [pose_of(image) for image in self._mapper.images]
+
+    def graph(self) -> LiveGraph:
+        """A copy of the live factor graph, and its values; both empty before the second keyframe.
+
+        Waits for the update that the graph is working on. Keys are GTSAM's symbols: ``X(i)`` the pose
+        (`world_from_cam`) of frame number i of this stream, counted from 0, where that is a keyframe; ``L(j)`` the
+        landmark of track j; ``A(i)`` scale and shift of the depth map of frame i (`graph.factors.affine_of_native`).
+        """
+        return self._mapper.graph() if self._mapper is not None else empty_graph()
 
     @property
     def points(self) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
