@@ -6,7 +6,6 @@ with its standard deviation (`sigma`). Frames are named by their name, with or w
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path, PurePath
@@ -25,6 +24,7 @@ Array = NDArray[np.float64]
 Vector = Sequence[float] | Array
 FrameKey = str | int
 
+_LARGEST = 1e12  # of a number, and of the inverse of one that is not 0: their squares and products stay finite
 _KINDS = ("poses", "points", "distances", "heights")
 
 
@@ -336,9 +336,9 @@ def _check_frame(key: Any) -> None:
 def _check_sigma(name: str, value: Any, needed: bool, *, zero: bool = False) -> None:
     if value is None and needed:
         raise InputError(f'"{name}" is missing')
-    if value is not None and (not _is_number(value) or value < 0 or (value == 0 and not zero)):
+    if value is not None and not (_is_number(value) and (value >= 1.0 / _LARGEST or (value == 0 and zero))):
         raise InputError(f'"{name}" is {value!r}; a positive number{" or 0" if zero else ""} is expected')
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float | np.number) and not isinstance(value, bool) and math.isfinite(value)
+    return isinstance(value, int | float | np.number) and not isinstance(value, bool) and abs(float(value)) <= _LARGEST

@@ -259,14 +259,31 @@ def assert_read_or_refused(read: Callable[[Path], object], path: Path) -> None:
         read(path)
 
 
-def test_numbers_that_overflow_say_nothing_beside_the_line(folder: Path) -> None:
-    poses = [{"frame": k, "position": [1e308 * k, -1e308, 0], "sigma": 0.1} for k in range(3)]
+@pytest.mark.parametrize(("position", "sigma"), [(1e308, 0.1), (-1e13, 0.1), (4.0, 1e-308), (4.0, 1e13)])
+def test_control_whose_squares_would_overflow(
+    folder: Path, capsys: pytest.CaptureFixture[str], position: float, sigma: float
+) -> None:
+    poses = [{"frame": k, "position": [k * position, k * k, 0], "sigma": sigma} for k in range(3)]
     (folder / "control.json").write_text(json.dumps({"poses": poses}))
-    command = ["reconstruct", "images", "--depth", "none", "--output", "out", "--control", "control.json"]
-    done = subprocess.run([sys.executable, "-m", "factorsfm", *command], capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert done.stderr.startswith("factorsfm: error: control")
-    assert done.stderr.count("\n") == 1
+    assert reconstruct("images", "--control", "control.json") == 2
+    assert_error(capsys.readouterr(), "control file control.json: poses[")
+
+
+def test_warnings_of_libraries_do_not_stand_beside_the_line_of_an_error(folder: Path) -> None:
+    program = """
+import sys, warnings
+import factorsfm.api
+from factorsfm.cli.main import main
+
+def fail(*_, **__):
+    warnings.warn("overflow")
+    raise factorsfm.InputError("too large")
+
+factorsfm.api.reconstruct = fail
+sys.exit(main(["reconstruct", "images", "--output", "out"]))
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (2, "factorsfm: error: too large\n")
 
 
 # --- the machine --------------------------------------------------------------------------------------------------
