@@ -24,7 +24,6 @@ from factorsfm.lens.lens import LensEstimate
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.polish.polish import polish
 from factorsfm.priors.depth import DepthPrior
-from factorsfm.priors.depth_map import DepthKind
 from factorsfm.priors.masks import MaskPrior
 from factorsfm.priors.read_priors import read_depth, read_mask
 from factorsfm.result.assembly import assemble
@@ -266,8 +265,7 @@ class ImageSet:
             colors,
             camera,
             lens_given=self._lens_given,
-            prior_given=self._depth is not None,
-            metric=self._depth is not None and self._depth.kind is DepthKind.METRIC,
+            depth_kind=None if self._depth is None else self._depth.kind,
             seconds={},
             options=options.to_dict(),
         )

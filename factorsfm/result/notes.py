@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import astuple
 
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 
 from factorsfm.control.fit import ControlFit
@@ -70,6 +71,15 @@ def lens_note(estimate: LensEstimate) -> str:
     elif held:
         note += "; no distortion was found"
     return f"{note}.{zoom}"
+
+
+def focal_origin_note(camera: pycolmap.Camera) -> str:
+    """Where a focal length comes from that was neither given nor estimated."""
+    origin = "that of the EXIF data" if camera.has_prior_focal_length else "a guess"
+    return (
+        f"The focal length is {origin} ({camera.mean_focal_length():.0f} pixels): no camera was given, and the lens "
+        "was to stay fixed."
+    )
 
 
 def shutter_note(shutter: RollingShutter, timestamps: Sequence[float | None]) -> str:

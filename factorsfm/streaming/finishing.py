@@ -17,7 +17,6 @@ from factorsfm.lens.rolling_shutter import Recording
 from factorsfm.mapping.mapper import Mapper
 from factorsfm.polish.polish import Polished, polish
 from factorsfm.priors.depth import DepthPrior
-from factorsfm.priors.depth_map import DepthKind
 from factorsfm.result.assembly import assemble
 from factorsfm.result.reconstruction import Reconstruction
 from factorsfm.streaming.frame_update import SeenFrame
@@ -69,8 +68,7 @@ class EndedShot:
             self.colors,
             self.camera,
             lens_given=self.lens_given,
-            prior_given=self.depth is not None,
-            metric=self.depth is not None and self.depth.kind is DepthKind.METRIC,
+            depth_kind=None if self.depth is None else self.depth.kind,
             seconds=dict(self.seconds),
             options=self.options.to_dict(),
         )

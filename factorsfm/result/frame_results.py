@@ -1,0 +1,105 @@
+"""What a polish says of each frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+import pycolmap
+
+from factorsfm.camera.projection import with_focal
+from factorsfm.mapping.mapped_images import MappedImage
+from factorsfm.polish.polish import Polished
+from factorsfm.result.reconstruction import FrameResult, PriorFit
+from factorsfm.support.status import FrameStatus, ShotKind
+
+_INLIER_SIGMAS = 8.0  # an observation with a larger reprojection error is no inlier
+_MAD_TO_SIGMA = 1.4826
+
+
+class SeenFrame(Protocol):
+    """What the result needs to know of a frame of the source."""
+
+    @property
+    def index(self) -> int: ...
+    @property
+    def name(self) -> str: ...
+    @property
+    def timestamp(self) -> float | None: ...
+
+
+def frame_results(
+    polished: Polished,
+    images: Sequence[MappedImage],
+    frames: Sequence[SeenFrame],
+    camera: pycolmap.Camera,
+    unit: float,
+) -> list[FrameResult]:
+    """The result of every frame: of the registered ones as the polish left them, of the others why they are not.
+
+    Args:
+        images, frames: of the source, in the same order.
+        camera: the lens as it was solved.
+        unit: length in the result of one unit of the polish.
+    """
+    row_of = {position: row for row, position in enumerate(polished.frames)}
+    results = []
+    for position, (frame, image) in enumerate(zip(frames, images, strict=True)):
+        result = FrameResult(
+            frame.index,
+            frame.name,
+            frame.timestamp,
+            image.status,
+            image.message,
+            keyframe=image.keyframe,
+            observations=len(image.tracks.ids),
+        )
+        if position in row_of:
+            _add_solution(result, polished, row_of[position], camera, unit)
+            result.prior = _prior_fit(polished, images, row_of[position], unit)
+        elif position in polished.left_out:
+            result.status, result.message = FrameStatus.TOO_FEW_INLIERS, polished.left_out[position]
+            result.keyframe = False
+        results.append(result)
+    return results
+
+
+def _add_solution(result: FrameResult, polished: Polished, row: int, camera: pycolmap.Camera, unit: float) -> None:
+    """Pose, covariance, lens and inliers of the camera with a row in the polish."""
+    state, lens = polished.state, polished.lens
+    rotation = pycolmap.Rotation3d(state.rotation[row])
+    result.cam_from_world = pycolmap.Rigid3d(rotation, state.translation[row] * unit)
+    result.covariance = polished.covariance[row].copy()
+    result.covariance[3:] *= unit
+    result.covariance[:, 3:] *= unit
+    result.observability = polished.observability[row]
+    if len(state.log_focal) > 1:
+        result.camera = with_focal(camera, float(state.focal[row]))
+        if lens is not None and lens.determined:
+            result.focal_std = float(lens.focal_std[state.group[row]])
+    errors = polished.errors[polished.observations.frame == row]
+    threshold = _INLIER_SIGMAS * polished.sigma
+    result.inliers = int((errors < threshold).sum())
+    result.reprojection_error = float(np.median(errors))
+    result.message = f"{result.inliers} of {len(errors)} tracks within {threshold:.2f} pixels"
+    if polished.motion.kind is ShotKind.STATIC:
+        result.status = FrameStatus.STATIC
+        result.message += "; the camera does not move"
+
+
+def _prior_fit(polished: Polished, images: Sequence[MappedImage], row: int, unit: float) -> PriorFit | None:
+    prior = polished.prior
+    if prior is None or row not in prior.images:
+        return None
+    i = int(np.flatnonzero(prior.images == row)[0])
+    depth = images[polished.frames[row]].tracks.depth
+    assert depth is not None
+    residual = prior.residual[prior.observations.image == i]
+    return PriorFit(
+        scale=float(polished.state.scale[i]) * depth.unit * unit,
+        shift=float(polished.state.shift[i]) * depth.unit,
+        scale_std=float(prior.scale_std[i]) * depth.unit * unit,
+        shift_std=float(prior.shift_std[i]) * depth.unit,
+        sigma=_MAD_TO_SIGMA * float(np.median(np.abs(residual))) * depth.unit,
+    )
