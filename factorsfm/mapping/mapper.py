@@ -24,14 +24,15 @@ from factorsfm.mapping.map_registration import register_by_corners
 from factorsfm.mapping.map_update import YOUNG_KEYFRAMES
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.mapping.point_map import PointMap
+from factorsfm.mapping.prior_trust import PriorTrust
 from factorsfm.mapping.registration import Registration
-from factorsfm.mapping.starter import Starter
+from factorsfm.mapping.starter import NOT_JOINED, Starter, passed_by
 from factorsfm.mapping.starts import NoStart, Start
 from factorsfm.priors.image_depth import ImageDepth
 from factorsfm.support.options import Options
 from factorsfm.support.parallax import parallax
 from factorsfm.support.status import FrameStatus
-from factorsfm.tracks.image_tracks import ImageTracks, shared_tracks
+from factorsfm.tracks.image_tracks import ImageTracks
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -39,13 +40,8 @@ Index = NDArray[np.int64]
 logger = logging.getLogger(__name__)
 
 _STATE = (
-    "focal", "first_focal", "keyframes", "new_points", "parallax", "started", "without_prior",
-    "_waits_for_depth", "_due", "_mirrored",
+    "focal", "first_focal", "keyframes", "new_points", "parallax", "started", "_due",
 )  # fmt: skip
-_DEPTH_PATIENCE = 3  # keyframes without a depth map after which one does without
-_NOT_JOINED = (FrameStatus.LOST, FrameStatus.TOO_FEW_INLIERS)
-_PATIENCE, _BARELY_STARTED = 5, 2  # images that do not join a map, and its keyframes, with which it is given up
-_MOST_MIRRORED = 3  # updates in a row; then it is the prior that is wrong, not the geometry
 _RUNNING_OUT = 0.5  # share of an image's tracks with a point, below which the map is extended at once
 _SETTLED, _SETTLED_DELAY = 5, 2  # keyframes of a map that changes little; frames that it waits longer for the graph
 _REACH = 60  # images to both sides of a lost one from which its tracks are triangulated
@@ -70,7 +66,6 @@ class Mapper(IncrementalMapper):
         self.parallax = 0.0  # largest so far
         self.note = ""  # what became of the map with the last image, where that is out of the ordinary
         self.starts_anew = False  # whether the map was given up with the last image
-        self.without_prior = ""  # why the depth prior takes no part any more
         self._graph = graph
         self._update: Future[MapUpdate] | None = None
         self._due = 0
@@ -79,10 +74,8 @@ class Mapper(IncrementalMapper):
         self._reads_every_depth = has_prior and (
             self._starter.kind == "pair" or self.options.registration_depth != "none"
         )
-        self._uses_keyframe_depth = has_prior and options.uses_depth
+        self._prior = PriorTrust(has_prior and options.uses_depth)
         self.started = False
-        self._waits_for_depth = 0
-        self._mirrored = 0  # updates in a row that were rolled back as mirrored
 
     # --- snapshots ----------------------------------------------------------------------------------------------
 
@@ -92,6 +85,7 @@ class Mapper(IncrementalMapper):
         return {
             **{name: getattr(self, name) for name in _STATE},
             "start_kind": self._starter.kind,
+            "prior": [self._prior.lost, self._prior.mirrored, self._prior.missing],
             "images": list(self.images),
             "points": self.points.table,
             "update": update,
@@ -102,6 +96,7 @@ class Mapper(IncrementalMapper):
         for name in _STATE:
             setattr(self, name, state[name])
         self._starter.kind = state["start_kind"]
+        self._prior = PriorTrust(self._prior.wanted, *state["prior"])
         self.images = list(state["images"])
         self.points = PointMap(state["points"])
         if state["update"] is not None:
@@ -154,7 +149,7 @@ class Mapper(IncrementalMapper):
             self._try_start(read_depth)
         else:
             self._extend(image, read_depth)
-            if not image.registered and self._passed_by():
+            if not image.registered and passed_by(self.images, len(self.keyframes), self.options.min_tracks):
                 self._start_anew()
                 self._try_start(read_depth)
 
@@ -209,7 +204,7 @@ class Mapper(IncrementalMapper):
         while found:
             found = False
             for image in itertools.chain(reversed(self.images), self.images):
-                if image.registered or image.status not in _NOT_JOINED:
+                if image.registered or image.status not in NOT_JOINED:
                     continue
                 known = image.status, image.message
                 self._map_tracks(image)
@@ -261,25 +256,13 @@ class Mapper(IncrementalMapper):
                 self._add_keyframe(image, None)
                 self._take_over()
 
-    def _passed_by(self) -> bool:
-        """Whether more images have failed to join the map than ever joined it, and show one thing themselves.
-
-        The map is of a flash then, or of the end of the shot before. One that has grown is never given up.
-        """
-        joined = sum(image.registered for image in self.images)
-        since = itertools.takewhile(lambda image: not image.registered, reversed(self.images))
-        failed = [image.tracks for image in since if image.status in _NOT_JOINED]
-        if len(self.keyframes) > _BARELY_STARTED or len(failed) <= max(_PATIENCE, joined):
-            return False
-        return shared_tracks(failed[0], failed[_PATIENCE]) >= self.options.min_tracks
-
     def _start_anew(self) -> None:
         """Forget the map; the images that did not join it wait for another."""
         self._take_over()
         joined = sum(image.registered for image in self.images)
         last = max(k for k, image in enumerate(self.images) if image.registered)
         for k, image in enumerate(self.images):
-            if k > last and image.status in _NOT_JOINED:
+            if k > last and image.status in NOT_JOINED:
                 image.forget(FrameStatus.WAITING, "waiting for the start of another map")
             elif image.registered:
                 image.forget(FrameStatus.LOST, f"on a map of {joined} images that none of those that followed joined")
@@ -355,9 +338,9 @@ class Mapper(IncrementalMapper):
         """Let the graph work on the keyframe; the map takes over its result after `graph_delay` frames."""
         keyframes = [replace(self.images[k]) for k in self.keyframes] + [replace(image)]
         copy = MapCopy(keyframes, self.points.copy(), self.options, self.focal, self._refine_focal)
-        if self.without_prior:
+        if self._prior.lost:
             copy = copy.without_prior()
-        read = read_depth if self._guided else None
+        read = read_depth if self._prior.active else None
         self._update = submit_update(self._graph, copy, read)
         image.keyframe = True
         settled = _SETTLED_DELAY if len(self.keyframes) >= _SETTLED else 0
@@ -372,15 +355,14 @@ class Mapper(IncrementalMapper):
         image = self.images[update.position]
         if image.tracks.depth is None and update.depth is not None:
             image.tracks = replace(image.tracks, depth=update.depth)
-        self._doubt_prior(update)
+        if self._prior.lose(update):
+            self._go_on_without_prior()
         if not self.started:
             return
-        missing = self._guided and update.depth is None
-        if missing and self.keyframes and self._waits_for_depth < _DEPTH_PATIENCE:
-            self._waits_for_depth += 1  # another image may have a map
+        if self.keyframes and self._prior.waits(update):
             image.keyframe = False
             return
-        self._waits_for_depth = 0
+        self._prior.missing = 0
         if not update.committed:
             image.keyframe = False
             return
@@ -401,27 +383,18 @@ class Mapper(IncrementalMapper):
             self._set_focal(update.focal)
 
     @property
-    def _guided(self) -> bool:
-        """Whether the depth prior takes part in the updates of the map."""
-        return self._uses_keyframe_depth and not self.without_prior
+    def without_prior(self) -> str:
+        """Why the depth prior takes no part any more, empty while it does."""
+        return self._prior.lost
 
-    def _doubt_prior(self, update: MapUpdate) -> None:
-        """Go on without the prior where it is none: it contradicts itself, or again and again the geometry.
-
-        A young map has the shape that it said, and so it is given up.
-        """
-        self._mirrored = self._mirrored + 1 if update.mirrored else 0
-        reason = update.reason if update.no_prior else ""
-        if self._mirrored >= _MOST_MIRRORED:
-            reason = f"the geometry is its mirror image in {self._mirrored} updates in a row"
-        if not reason or not self._guided:
-            return
-        self.without_prior, self._starter.kind = reason, "essential"
-        self.note = f"going on without the depth prior: {reason}"
+    def _go_on_without_prior(self) -> None:
+        """Leave the prior out from now on. A young map has the shape that the prior gave it, and is given up."""
+        self._starter.kind = "essential"
+        self.note = f"going on without the depth prior: {self._prior.lost}"
         if len(self.keyframes) > YOUNG_KEYFRAMES:
             logger.warning(self.note)
             return
         for image in self.images:
-            if image.registered or image.status in _NOT_JOINED:
+            if image.registered or image.status in NOT_JOINED:
                 image.forget(FrameStatus.WAITING, "waiting for a start without the depth prior")
         self._give_up_map(f"{self.note}; starting anew")

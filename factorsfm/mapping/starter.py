@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -10,11 +11,14 @@ from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.mapping.starts import NoStart, Start, start_essential_among, start_flat, start_lifted, start_pair
 from factorsfm.priors.image_depth import ImageDepth
 from factorsfm.support.options import MapperOptions
-from factorsfm.tracks.image_tracks import ImageTracks
+from factorsfm.support.status import FrameStatus
+from factorsfm.tracks.image_tracks import ImageTracks, shared_tracks
 
 logger = logging.getLogger(__name__)
 
 _PAIR_WINDOW = 10  # images among which the paper's initial pair is sought
+NOT_JOINED = (FrameStatus.LOST, FrameStatus.TOO_FEW_INLIERS)
+_PATIENCE, _BARELY_STARTED = 5, 2  # images that do not join a map, and its keyframes, with which it is given up
 _LIFT_PATIENCE = 10  # images without a usable depth map after which the start does without
 
 
@@ -71,3 +75,20 @@ class Starter:
 
 def _tracks(images: Sequence[MappedImage]) -> list[ImageTracks]:
     return [image.tracks for image in images]
+
+
+def passed_by(images: Sequence[MappedImage], keyframes: int, min_tracks: int) -> bool:
+    """Whether more images have failed to join the map than ever joined it, and share tracks among themselves.
+
+    The map is of a flash then, or of the end of the shot before. One that has grown is never given up.
+
+    Args:
+        images: in order of time; keyframes: number of those of the map.
+        min_tracks: that two images share if they show the same scene.
+    """
+    joined = sum(image.registered for image in images)
+    since = itertools.takewhile(lambda image: not image.registered, reversed(images))
+    failed = [image.tracks for image in since if image.status in NOT_JOINED]
+    if keyframes > _BARELY_STARTED or len(failed) <= max(_PATIENCE, joined):
+        return False
+    return shared_tracks(failed[0], failed[_PATIENCE]) >= min_tracks
