@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
@@ -28,8 +28,7 @@ from factorsfm.result.reconstruction import Reconstruction
 from factorsfm.streaming.stream import Stream
 from factorsfm.support.errors import InputError
 from factorsfm.support.options import LensFreedom, Options, ShutterUse
-
-Progress = Callable[[str, int, int | None], None]
+from factorsfm.support.progress import Progress
 
 
 def reconstruct(

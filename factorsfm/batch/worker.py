@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from contextlib import nullcontext
 
 from factorsfm import api
 from factorsfm.batch.plan import Job, Video, shots_of
 from factorsfm.report.result_folder import write_failure, write_folder
 from factorsfm.support.errors import FactorsfmError, ReconstructionError
+from factorsfm.support.progress import Progress
 from factorsfm.support.threads import OneThreadEach
-
-Progress = Callable[[str, int, int | None], None]
 
 
 def find_shots_of(video: Video, *, one_thread: bool) -> list[range]:

@@ -1,4 +1,4 @@
-"""``factorsfm batch``: the arguments, and what they do."""
+"""``factorsfm batch``: every shot of a film, or of a folder of films."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ from pathlib import Path
 from factorsfm.batch.crew import Crew, open_crew
 from factorsfm.batch.index import Entry, Index, shots_known
 from factorsfm.batch.plan import Job, Method, Video, find_videos, plan_jobs
-from factorsfm.batch.worker import Progress, find_shots_of, reconstruct_shot
+from factorsfm.batch.worker import find_shots_of, reconstruct_shot
 from factorsfm.camera.files import open_camera
+from factorsfm.cli.command import Command, add_method, add_output, count_of
+from factorsfm.cli.progress_line import ProgressLine
 from factorsfm.priors.depth import open_depth
 from factorsfm.priors.masks import open_masks
 from factorsfm.report.result_folder import check_directory, is_earlier_result, write_failure
@@ -29,10 +31,13 @@ logger = logging.getLogger(__name__)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments that only this command has."""
+    """Declare the arguments of the command."""
+    parser.add_argument("source", metavar="SOURCE", help="a video file, or a folder of video files")
+    add_output(parser, "folder of the results: new, empty, or that of an earlier run, which goes on")
+    add_method(parser)
     parser.add_argument(
         "--workers",
-        type=_count,
+        type=count_of("processes"),
         metavar="N",
         help="processes, each with a shot and its share of the cores (default: one for every core)",
     )
@@ -41,19 +46,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(arguments: argparse.Namespace, progress: Progress, show: Show) -> str:
-    """Reconstruct every shot, or go on where an earlier run has stopped.
-
-    Args:
-        progress: told the stages of a shot where this process does it itself; show: one line on the whole.
-
-    Returns:
-        Sentences for the user.
-
-    Raises:
-        InputError: the input cannot be used.
-        ReconstructionError: none of the shots could be reconstructed; the index says why.
-    """
+def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
+    """Reconstruct every shot, or go on where an earlier run has stopped; see `Command.run`."""
+    show = progress.show
     if arguments.workers and arguments.scheduler:
         raise InputError("--workers and --scheduler cannot be combined: a cluster has its own workers")
     source, output = Path(arguments.source), arguments.output
@@ -192,7 +187,12 @@ def _conclusion(entries: Sequence[Entry], unread: dict[Video, str], output: Path
     return "\n".join([*lines, f"Results in {output}; open {output / 'index.html'}"])
 
 
-def _count(text: str) -> int:
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f'"{text}" is no number of processes')
-    return int(text)
+COMMAND = Command(
+    "batch",
+    help="reconstruct every shot of a film, or of a folder of films",
+    description="Find the shots of a film, or of all films in a folder, and reconstruct each; goes on where it was "
+    "interrupted.",
+    add_arguments=add_arguments,
+    run=run,
+    followed=True,
+)

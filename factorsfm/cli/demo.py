@@ -1,9 +1,9 @@
-"""The demonstration: render a shot, reconstruct it from its video file, compare with the truth."""
+"""``factorsfm demo``: render a shot, reconstruct it from its video file, compare with the truth."""
 
 from __future__ import annotations
 
+import argparse
 import tempfile
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,12 +11,16 @@ import numpy as np
 
 from factorsfm import api
 from factorsfm.camera.files import read_camera
+from factorsfm.cli.command import Command
+from factorsfm.cli.progress_line import ProgressLine
 from factorsfm.evaluation.metrics import TrajectoryErrors, trajectory_errors
 from factorsfm.export.writing import complete_file
 from factorsfm.frames.writing import write_image
 from factorsfm.report.picture import draw_picture
 from factorsfm.report.result_folder import check_directory, write_folder
 from factorsfm.result.reconstruction import Reconstruction
+from factorsfm.result.summary import conclusion
+from factorsfm.support.progress import Progress
 from factorsfm.support.similarity import pose_arrays
 from factorsfm.synthetic import render_shot, write_shot
 
@@ -45,7 +49,7 @@ class DemoResult:
         )
 
 
-def run_demo(directory: str | Path, progress: Callable[[str, int, int | None], None] | None = None) -> DemoResult:
+def run_demo(directory: str | Path, progress: Progress | None = None) -> DemoResult:
     """Render, reconstruct and compare; writes the result folder and picture.png into it.
 
     Args:
@@ -79,3 +83,29 @@ def run_demo(directory: str | Path, progress: Callable[[str, int, int | None], N
     with complete_file(Path(directory) / "picture.png") as file:
         write_image(file, draw_picture(reconstruction))
     return DemoResult(reconstruction, errors, path_length)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
+    parser.add_argument(
+        "--output",
+        type=Path,
+        default=Path("factorsfm_demo"),
+        metavar="DIR",
+        help="folder of the result (default: %(default)s)",
+    )
+
+
+def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
+    """Write the result and compare it with the truth; see `Command.run`."""
+    result = run_demo(arguments.output, progress)
+    return f"{conclusion(result.reconstruction, arguments.output)}\n{result.comparison()}"
+
+
+COMMAND = Command(
+    "demo",
+    help="reconstruct a rendered shot and compare it with the truth",
+    description="Render a small shot, reconstruct it from its video file, and compare with the truth.",
+    add_arguments=add_arguments,
+    run=run,
+)

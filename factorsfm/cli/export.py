@@ -1,4 +1,4 @@
-"""``factorsfm export``: the arguments, and what they do."""
+"""``factorsfm export``: files for another tool."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import argparse
 from dataclasses import fields
 from pathlib import Path
 
+from factorsfm.cli.command import Command
+from factorsfm.cli.progress_line import ProgressLine
 from factorsfm.export.formats import FORMATS, export
 from factorsfm.export.options import ExportOptions, UpAxis
 from factorsfm.result.reading import read_result
@@ -32,15 +34,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--footage", type=Path, metavar="VIDEO|FOLDER", help="the shot (default: the source)")
 
 
-def run(arguments: argparse.Namespace) -> str:
-    """Write the export.
-
-    Returns:
-        A sentence for the user.
-
-    Raises:
-        InputError: nothing has been written.
-    """
+def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
+    """Write the export; see `Command.run`."""
     given = {field.name: getattr(arguments, field.name) for field in fields(ExportOptions)}
     options = ExportOptions(**given)
     reconstruction = read_result(arguments.result)
@@ -52,3 +47,12 @@ def run(arguments: argparse.Namespace) -> str:
 
 def _formats_help() -> str:
     return "; ".join(f"{name}: {format.description}" for name, format in FORMATS.items())
+
+
+COMMAND = Command(
+    "export",
+    help="write a result for another tool: Nuke, Blender, USD and others",
+    description="Write a result for another tool.",
+    add_arguments=add_arguments,
+    run=run,
+)

@@ -1,11 +1,12 @@
-"""``factorsfm overlay``: the arguments, and what they do."""
+"""``factorsfm overlay``: the footage with what is locked into the scene."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from pathlib import Path
 
+from factorsfm.cli.command import Command
+from factorsfm.cli.progress_line import ProgressLine
 from factorsfm.report.overlay import CODECS, LAYERS, write_overlay
 from factorsfm.result.reading import read_result
 
@@ -26,16 +27,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--hide", nargs="+", choices=LAYERS, default=[], help="what not to draw")
 
 
-def run(arguments: argparse.Namespace, progress: Callable[[str, int, int | None], None]) -> str:
-    """Write the overlay.
-
-    Returns:
-        A sentence for the user.
-
-    Raises:
-        InputError: nothing has been written.
-    """
+def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
+    """Write the overlay; see `Command.run`."""
     reconstruction = read_result(arguments.result)
     props = write_overlay(reconstruction, arguments.output, arguments.source, hide=arguments.hide, progress=progress)
     plane = _PLANES[props.plane.kind].format(n=len(props.plane.support))
     return f"Wrote {arguments.output}: the grid is on {plane}; a cell is {props.cell:g} wide."
+
+
+COMMAND = Command(
+    "overlay",
+    help="write the footage with points, a grid and cubes locked into the scene",
+    description="Write the footage as a video with points, a grid and cubes locked into the scene.",
+    add_arguments=add_arguments,
+    run=run,
+)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -25,14 +25,13 @@ from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.support.errors import InputError, ReconstructionError
 from factorsfm.support.file_names import check_name
 from factorsfm.support.options import Options
+from factorsfm.support.progress import Progress
 from factorsfm.support.similarity import Similarity
 from factorsfm.support.status import FrameStatus, ShotKind
 from factorsfm.support.threads import OneThreadEach
 from factorsfm.tracks.image_tracks import ImageTracks
 from factorsfm.tracks.match_tracks import tracks_from_matches
 from factorsfm.tracks.matches import match_images
-
-Progress = Callable[[str, int, int | None], None]
 
 _MOST_OF_A_SHOT = 40  # frames of a shot with which new images are matched
 _SAME_ASPECT = 0.01

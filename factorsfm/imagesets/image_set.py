@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,6 +29,7 @@ from factorsfm.result.assembly import assemble
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.support.errors import InputError, ReconstructionError
 from factorsfm.support.options import Options
+from factorsfm.support.progress import Progress
 from factorsfm.support.stages import StageSeconds
 from factorsfm.support.status import FrameStatus
 from factorsfm.support.threads import OneThreadEach
@@ -39,7 +39,6 @@ from factorsfm.tracks.match_tracks import tracks_from_matches
 from factorsfm.tracks.matches import match_images
 
 Array = NDArray[np.float64]
-Progress = Callable[[str, int, int | None], None]
 
 logger = logging.getLogger(__name__)
 

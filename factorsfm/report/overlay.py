@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +21,7 @@ from factorsfm.report.props import Props, place_props
 from factorsfm.report.wording import status_words
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.support.errors import InputError
+from factorsfm.support.progress import Progress
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -86,7 +87,7 @@ def write_overlay(
     source: str | Path | None = None,
     *,
     hide: Sequence[str] = (),
-    progress: Callable[[str, int, int | None], None] | None = None,
+    progress: Progress | None = None,
 ) -> Props:
     """Write the footage with what is locked into the scene drawn over it, one picture a frame of the reconstruction.
 

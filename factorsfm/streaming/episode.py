@@ -21,6 +21,7 @@ from factorsfm.streaming.stream import Stream
 from factorsfm.support.context import Closing
 from factorsfm.support.errors import ReconstructionError
 from factorsfm.support.options import Options
+from factorsfm.support.progress import Progress
 
 _CERTAIN = 5  # frames of a shot after which the one before cannot come back
 
@@ -110,7 +111,7 @@ class Episode(Closing):
         """That of the shot to which the newest frame belongs."""
         return self._streams[self._shot]
 
-    def finish(self, progress: Callable[[str, int, int | None], None] | None = None) -> list[ShotResult]:
+    def finish(self, progress: Progress | None = None) -> list[ShotResult]:
         """Polish what is not polished yet.
 
         Returns:
@@ -129,12 +130,12 @@ class Episode(Closing):
         for stream in (*self._ended, *self._streams.values()):
             stream.close()
 
-    def _end(self, number: int, progress: Callable[[str, int, int | None], None] | None) -> None:
+    def _end(self, number: int, progress: Progress | None) -> None:
         """No further frame belongs to a shot."""
         self._ended.append(self._streams.pop(number))
         self._results.append(self._worker.submit(self._finish, progress))
 
-    def _finish(self, progress: Callable[[str, int, int | None], None] | None) -> ShotResult | None:
+    def _finish(self, progress: Progress | None) -> ShotResult | None:
         """Polish the next shot that has ended; its result, if nobody else takes it."""
         stream = self._ended.popleft()
         first, last = stream.frames[0].index, stream.frames[-1].index

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +22,7 @@ from factorsfm.result.reconstruction import Reconstruction
 from factorsfm.streaming.frame_update import SeenFrame
 from factorsfm.support.errors import ReconstructionError
 from factorsfm.support.options import Options
+from factorsfm.support.progress import Progress
 from factorsfm.support.stages import StageSeconds
 
 
@@ -49,7 +50,7 @@ class EndedShot:
     options: Options
     seconds: StageSeconds
 
-    def reconstruction(self, progress: Callable[[str, int, int | None], None] | None) -> Reconstruction:
+    def reconstruction(self, progress: Progress | None) -> Reconstruction:
         """Polish over all frames and tracks; errors as in `Stream.finish`."""
         control = self._located_control()
         registered = sum(image.registered for image in self.mapper.images)
@@ -79,9 +80,7 @@ class EndedShot:
             result.notes.append(f"The map went on without the depth prior: {self.mapper.without_prior}.")
         return result
 
-    def _polished(
-        self, control: LocatedControl | None, progress: Callable[[str, int, int | None], None] | None
-    ) -> Polished:
+    def _polished(self, control: LocatedControl | None, progress: Progress | None) -> Polished:
         return polish(
             self.mapper.images,
             self.mapper.points.all(),

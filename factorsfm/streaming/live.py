@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
@@ -22,6 +22,7 @@ from factorsfm.streaming.frame_update import FrameUpdate
 from factorsfm.streaming.stream import Stream
 from factorsfm.support.context import Closing
 from factorsfm.support.options import Options
+from factorsfm.support.progress import Progress
 
 
 class Live(Closing, Iterator[FrameUpdate]):
@@ -38,7 +39,7 @@ class Live(Closing, Iterator[FrameUpdate]):
     def __next__(self) -> FrameUpdate:
         return self.stream.push(next(self.source))
 
-    def finish(self, progress: Callable[[str, int, int | None], None] | None = None) -> Reconstruction:
+    def finish(self, progress: Progress | None = None) -> Reconstruction:
         """Stop reading, and polish over the frames that came; errors as in `Stream.finish`."""
         with self:
             self.source.close()

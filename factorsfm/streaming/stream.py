@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import astuple
 from pathlib import Path
@@ -37,6 +36,7 @@ from factorsfm.streaming.view_finder import ViewFinder
 from factorsfm.support.context import Closing
 from factorsfm.support.errors import InputError, ModelError, ReconstructionError
 from factorsfm.support.options import Options
+from factorsfm.support.progress import Progress
 from factorsfm.support.stages import StageSeconds
 from factorsfm.support.status import FrameStatus
 from factorsfm.support.threads import OneThreadEach
@@ -234,7 +234,7 @@ class Stream(Closing):
             self._mapper = self._new_mapper()
             self._mapper.restore(state["mapper"])
 
-    def finish(self, progress: Callable[[str, int, int | None], None] | None = None) -> Reconstruction:
+    def finish(self, progress: Progress | None = None) -> Reconstruction:
         """Polish over all frames and tracks.
 
         Raises:

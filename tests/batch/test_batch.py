@@ -286,7 +286,7 @@ def test_an_unexpected_error_stops_nothing_and_is_tried_again(
 def test_the_line_of_progress(batch: Run, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.stderr.isatty", lambda: True)
     monkeypatch.setattr("shutil.get_terminal_size", lambda: os.terminal_size((200, 24)))
-    monkeypatch.setattr("factorsfm.cli.main._Progress._SECONDS_BETWEEN", 0.0)
+    monkeypatch.setattr("factorsfm.cli.progress_line.ProgressLine._SECONDS_BETWEEN", 0.0)
     assert batch() == 0
     lines = capsys.readouterr().err.split("\r\x1b[K")
     assert "looking for cuts: 1 of 1 videos" in lines

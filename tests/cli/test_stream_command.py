@@ -80,7 +80,7 @@ def test_a_stream_gives_the_result_of_the_one_call(
 def test_the_line_of_progress(stream: Run, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.stderr.isatty", lambda: True)
     monkeypatch.setattr("shutil.get_terminal_size", lambda: os.terminal_size((200, 24)))
-    monkeypatch.setattr("factorsfm.cli.main._Progress._SECONDS_BETWEEN", 0.0)
+    monkeypatch.setattr("factorsfm.cli.progress_line.ProgressLine._SECONDS_BETWEEN", 0.0)
     monkeypatch.setattr("sys.stdout", sys.stderr)  # as on a terminal
     assert stream("--frames", "2:6") == 0
     lines = capsys.readouterr().err.split("\r\x1b[K")

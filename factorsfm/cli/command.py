@@ -1,0 +1,117 @@
+"""What every command of the command line consists of, and the arguments that several of them take."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, get_args
+
+from factorsfm.cli.progress_line import ProgressLine
+from factorsfm.frames.ranges import parse_range
+from factorsfm.priors.depth_map import DepthKind
+from factorsfm.support.options import PRESETS, LensFreedom, ShutterUse
+
+RESULT_FOLDER = "folder of the result: new, empty, or holding an earlier result, which is replaced"
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """A command.
+
+    Attributes:
+        help: in the list of commands; description: in its own help.
+        add_arguments: declares what it takes.
+        run: does it, and returns sentences for the user. Raises InputError where the input cannot be used, and
+            ReconstructionError where a shot cannot be reconstructed.
+        followed: whether warnings are shown at once, since somebody follows what it does.
+    """
+
+    name: str
+    help: str
+    description: str
+    add_arguments: Callable[[argparse.ArgumentParser], None]
+    run: Callable[[argparse.Namespace, ProgressLine], str]
+    followed: bool = False
+
+
+def add_output(parser: argparse.ArgumentParser, help_: str = RESULT_FOLDER) -> None:
+    """Declare where the result goes."""
+    parser.add_argument("--output", type=Path, required=True, metavar="DIR", help=help_)
+
+
+def add_method(parser: argparse.ArgumentParser) -> None:
+    """Declare with what a shot is reconstructed."""
+    parser.add_argument(
+        "--camera", type=Path, metavar="FILE.json", help="width, height, fx, fy, cx, cy; default: estimated"
+    )
+    parser.add_argument(
+        "--depth",
+        default="tcmonodepth",
+        metavar="MODEL.onnx|NAME|FOLDER|none",
+        help="depth prior: a network, a named model, or a folder of maps (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--depth-kind",
+        choices=[kind.value for kind in DepthKind],
+        help="what the depth prior holds, where it cannot be known",
+    )
+    parser.add_argument(
+        "--masks",
+        metavar="FOLDER|MODEL.onnx|none",
+        help="what moves and is to be ignored: non-zero in the masks (default: none)",
+    )
+    parser.add_argument(
+        "--lens",
+        choices=get_args(LensFreedom),
+        default="auto",
+        help="what of the lens is estimated where the shot determines it: nothing, the focal length, also the radial "
+        "distortion, or also the principal point; radial: the distortion alone; zoom: distortion, and a focal length "
+        "for every frame; auto: fixed with --camera, distortion without",
+    )
+    parser.add_argument(
+        "--shutter",
+        choices=get_args(ShutterUse),
+        default="auto",
+        help="what is done with a rolling shutter that the video shows. auto: lens and points are free of it, poses "
+        "fit the recorded images; rolling: poses are those of the moment at which the middle of the image is read; "
+        "global: it is not looked for",
+    )
+    parser.add_argument("--preset", choices=list(PRESETS), default="default", help="default: %(default)s")
+
+
+def add_range(parser: argparse.ArgumentParser) -> None:
+    """Declare which frames are read."""
+    parser.add_argument("--frames", metavar="START:STOP[:STEP]", help="counted from 0, without STOP")
+
+
+def range_of(arguments: argparse.Namespace) -> slice | None:
+    """The frames to read; None is all of them.
+
+    Raises:
+        InputError: the range is none.
+    """
+    return parse_range(arguments.frames) if arguments.frames is not None else None
+
+
+def unless_none(text: str | None) -> str | None:
+    """The word "none" is no value."""
+    return None if text == "none" else text
+
+
+def as_given(arguments: argparse.Namespace) -> dict[str, Any]:
+    """What is written beside the reason of a failure."""
+    return {name: value for name, value in vars(arguments).items() if name not in ("command", "output", "verbose")}
+
+
+def count_of(what: str) -> Callable[[str], int]:
+    """The type of an argument that is a number of something, 1 or more."""
+
+    def count(text: str) -> int:
+        if not re.fullmatch(r"0*[1-9]\d{0,8}", text, re.ASCII):
+            raise argparse.ArgumentTypeError(f'"{text}" is no number of {what}')
+        return int(text)
+
+    return count

@@ -1,0 +1,48 @@
+"""Ctrl-C in a stream: the first one ends the frames, and the result is written."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+from factorsfm.frames.frame import Frame
+
+
+class Interrupt:
+    """The first Ctrl-C ends the frames, never in the middle of one; a second one ends everything."""
+
+    def __init__(self) -> None:
+        self._asked = False
+        self._waiting = False
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        self._asked = True
+        if self._waiting:
+            raise KeyboardInterrupt
+
+    def until(self, frames: Iterator[Frame]) -> Iterator[Frame]:
+        """The frames that come before the interrupt."""
+        while not self._asked:
+            try:
+                self._waiting = True
+                frame = next(frames, None)
+                self._waiting = False
+            except KeyboardInterrupt:
+                return
+            if frame is None:
+                return
+            yield frame
+
+
+@contextmanager
+def first_interrupt() -> Iterator[Interrupt]:
+    """Takes Ctrl-C for as long as its context lasts."""
+    interrupt = Interrupt()
+    before = signal.signal(signal.SIGINT, interrupt)
+    try:
+        yield interrupt
+    finally:
+        signal.signal(signal.SIGINT, before)

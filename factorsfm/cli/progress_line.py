@@ -1,0 +1,65 @@
+"""The line of progress on a terminal, and the log beside it."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import time
+from types import TracebackType
+from typing import TextIO
+
+
+class ProgressLine:
+    """One line on a terminal, rewritten; nothing where it is not enabled. A `Progress` that can be called."""
+
+    _SECONDS_BETWEEN = 0.1
+
+    def __init__(self, stream: TextIO, enabled: bool) -> None:
+        self._stream = stream
+        self._enabled = enabled
+        self._stage = ""
+        self._written = 0.0
+        self._shown = False
+
+    def __call__(self, stage: str, done: int, total: int | None) -> None:
+        count = f" {done}/{total}" if total is not None else f" {done}" if done else ""
+        self.show(f"{stage}{count}", at_once=stage != self._stage)
+        self._stage = stage
+
+    def show(self, text: str, at_once: bool = False) -> None:
+        """Replace the line; a text that comes too soon after another one is left out."""
+        now = time.monotonic()
+        if not self._enabled or (not at_once and now < self._written + self._SECONDS_BETWEEN):
+            return
+        self._written, self._shown = now, True
+        columns = shutil.get_terminal_size().columns
+        self._stream.write(f"\r\x1b[K{text[: columns - 1]}")
+        self._stream.flush()
+
+    def clear(self) -> None:
+        """Remove the line."""
+        if self._shown:
+            self._stage, self._shown = "", False
+            self._stream.write("\r\x1b[K")
+            self._stream.flush()
+
+    def __enter__(self) -> ProgressLine:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.clear()
+
+
+class LogHandler(logging.StreamHandler[TextIO]):
+    """Writes log lines to stderr, in place of the line of progress."""
+
+    def __init__(self, line: ProgressLine) -> None:
+        super().__init__()
+        self.setFormatter(logging.Formatter("%(levelname)s %(name)s: %(message)s"))
+        self._line = line
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._line.clear()
+        super().emit(record)

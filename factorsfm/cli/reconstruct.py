@@ -1,0 +1,87 @@
+"""``factorsfm reconstruct``: a shot, or a set of photographs."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+from factorsfm import api
+from factorsfm.camera.files import open_camera
+from factorsfm.cli.command import Command, add_method, add_output, add_range, as_given, range_of, unless_none
+from factorsfm.cli.progress_line import ProgressLine
+from factorsfm.report.result_folder import check_directory, write_failure, write_folder
+from factorsfm.result.summary import conclusion
+from factorsfm.support.errors import ReconstructionError
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
+    parser.add_argument("source", metavar="SOURCE", help="a video file, or a folder of images")
+    add_output(parser)
+    add_method(parser)
+    add_range(parser)
+    parser.add_argument(
+        "--unordered",
+        action="store_true",
+        help="match the images of a folder with each other, in any order; by itself where they are hardly a shot",
+    )
+    parser.add_argument(
+        "--features",
+        default="sift",
+        metavar="sift|xfeat|FOLDER",
+        help="keypoints of an unordered set; for xfeat the folder of its networks is named here or in FACTORSFM_MODELS "
+        "(default: %(default)s)",
+    )
+    parser.add_argument(
+        "--control",
+        type=Path,
+        metavar="FILE.json",
+        help="known poses, points, distances and heights: the result is in their world and unit",
+    )
+    parser.add_argument(
+        "--work",
+        type=Path,
+        metavar="DIR",
+        help="keep features and matches of an unordered set here: an interrupted run goes on from them",
+    )
+
+
+def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
+    """Write the result, or the reason why there is none; see `Command.run`."""
+    check_directory(arguments.output)
+    camera, frames = open_camera(arguments.camera), range_of(arguments)
+    begin = time.perf_counter()
+    try:
+        reconstruction = api.reconstruct(
+            arguments.source,
+            camera=camera,
+            depth=unless_none(arguments.depth),
+            depth_kind=arguments.depth_kind,
+            masks=unless_none(arguments.masks),
+            frames=frames,
+            preset=arguments.preset,
+            lens=arguments.lens,
+            shutter=arguments.shutter,
+            unordered=arguments.unordered or None,
+            features=arguments.features,
+            work=arguments.work,
+            control=arguments.control,
+            progress=progress,
+        )
+    except ReconstructionError as error:
+        seconds = {"total": time.perf_counter() - begin}
+        write_failure(arguments.output, str(error), error.frames, as_given(arguments), seconds)
+        raise
+    progress("writing", 0, None)
+    write_folder(reconstruction, arguments.output)
+    return conclusion(reconstruction, arguments.output)
+
+
+COMMAND = Command(
+    "reconstruct",
+    help="recover camera path, lens and points of a shot",
+    description="Recover camera path, lens and sparse points of a shot.",
+    add_arguments=add_arguments,
+    run=run,
+)
