@@ -12,7 +12,11 @@ from typing import Any, get_args
 from factorsfm.cli.progress_line import ProgressLine
 from factorsfm.frames.ranges import parse_range
 from factorsfm.priors.depth_map import DepthKind
+from factorsfm.report.result_folder import write_folder
+from factorsfm.result.reconstruction import Reconstruction
+from factorsfm.result.summary import conclusion
 from factorsfm.support.options import PRESETS, LensFreedom, ShutterUse
+from factorsfm.support.progress import Progress
 
 RESULT_FOLDER = "folder of the result: new, empty, or holding an earlier result, which is replaced"
 
@@ -104,6 +108,13 @@ def unless_none(text: str | None) -> str | None:
 def as_given(arguments: argparse.Namespace) -> dict[str, Any]:
     """What is written beside the reason of a failure."""
     return {name: value for name, value in vars(arguments).items() if name not in ("command", "output", "verbose")}
+
+
+def write_result(reconstruction: Reconstruction, output: Path, progress: Progress) -> str:
+    """Write the result folder; what to say of it."""
+    progress("writing", 0, None)
+    write_folder(reconstruction, output)
+    return conclusion(reconstruction, output)
 
 
 def count_of(what: str) -> Callable[[str], int]:

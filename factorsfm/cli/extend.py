@@ -5,11 +5,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from factorsfm.cli.command import Command, add_output, add_range, range_of
+from factorsfm.cli.command import Command, add_output, add_range, range_of, write_result
 from factorsfm.cli.progress_line import ProgressLine
 from factorsfm.imagesets.add_images import add_images
-from factorsfm.report.result_folder import check_directory, write_folder
-from factorsfm.result.summary import conclusion
+from factorsfm.report.result_folder import check_directory
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -39,9 +38,7 @@ def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
         work=arguments.work,
         progress=progress,
     )
-    progress("writing", 0, None)
-    write_folder(reconstruction, arguments.output)
-    return conclusion(reconstruction, arguments.output)
+    return write_result(reconstruction, arguments.output, progress)
 
 
 COMMAND = Command(

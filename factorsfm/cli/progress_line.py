@@ -5,12 +5,13 @@ from __future__ import annotations
 import logging
 import shutil
 import time
-from types import TracebackType
 from typing import TextIO
 
+from factorsfm.support.context import Closing
 
-class ProgressLine:
-    """One line on a terminal, rewritten; nothing where it is not enabled. A `Progress` that can be called."""
+
+class ProgressLine(Closing):
+    """One line on a terminal, rewritten; nothing where it is not enabled. It can be called as a `Progress`."""
 
     _SECONDS_BETWEEN = 0.1
 
@@ -43,12 +44,7 @@ class ProgressLine:
             self._stream.write("\r\x1b[K")
             self._stream.flush()
 
-    def __enter__(self) -> ProgressLine:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
         self.clear()
 
 

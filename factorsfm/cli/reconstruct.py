@@ -8,10 +8,18 @@ from pathlib import Path
 
 from factorsfm import api
 from factorsfm.camera.files import open_camera
-from factorsfm.cli.command import Command, add_method, add_output, add_range, as_given, range_of, unless_none
+from factorsfm.cli.command import (
+    Command,
+    add_method,
+    add_output,
+    add_range,
+    as_given,
+    range_of,
+    unless_none,
+    write_result,
+)
 from factorsfm.cli.progress_line import ProgressLine
-from factorsfm.report.result_folder import check_directory, write_failure, write_folder
-from factorsfm.result.summary import conclusion
+from factorsfm.report.result_folder import check_directory, write_failure
 from factorsfm.support.errors import ReconstructionError
 
 
@@ -73,9 +81,7 @@ def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
         seconds = {"total": time.perf_counter() - begin}
         write_failure(arguments.output, str(error), error.frames, as_given(arguments), seconds)
         raise
-    progress("writing", 0, None)
-    write_folder(reconstruction, arguments.output)
-    return conclusion(reconstruction, arguments.output)
+    return write_result(reconstruction, arguments.output, progress)
 
 
 COMMAND = Command(

@@ -8,11 +8,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from factorsfm.cli.command import as_given
+from factorsfm.cli.command import as_given, write_result
 from factorsfm.frames.live_sources import Source
 from factorsfm.report.result_folder import write_failure, write_folder
 from factorsfm.result.reconstruction import Reconstruction
-from factorsfm.result.summary import conclusion, verdict
+from factorsfm.result.summary import verdict
 from factorsfm.streaming.episode import ShotResult
 from factorsfm.streaming.stream import Stream
 from factorsfm.support.errors import ReconstructionError
@@ -47,9 +47,7 @@ class StreamResults:
             write_failure(self._output, str(error), error.frames, self._given, self._seconds())
             raise
         viewer.log_result(reconstruction)
-        progress("writing", 0, None)
-        write_folder(self._completed(reconstruction), self._output)
-        return conclusion(reconstruction, self._output)
+        return write_result(self._completed(reconstruction), self._output, progress)
 
     def write_shot(self, shot: ShotResult) -> None:
         """Write what has become of the next shot of a film."""

@@ -16,7 +16,8 @@ from factorsfm.camera.projection import PIXEL_CENTER
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.reading import read_frames
 from factorsfm.frames.unordered import read_images
-from factorsfm.imagesets.joint_adjustment import View, extended, local_pose
+from factorsfm.imagesets.joint_adjustment import extended, local_pose
+from factorsfm.imagesets.joint_problem import View
 from factorsfm.imagesets.mapper import SetMapper, for_image_sets
 from factorsfm.imagesets.photo_folder import pixel_digest, work_folder, write_once
 from factorsfm.result.image_sources import AddedImages, ImageSource, added_images, image_sources

@@ -19,7 +19,7 @@ from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.polish.polish import Polished
 from factorsfm.priors.depth_map import DepthKind
 from factorsfm.result.frame_results import SeenFrame, frame_results
-from factorsfm.result.notes import focal_origin_note, notes_on, observability_notes, shutter_note
+from factorsfm.result.notes import result_notes
 from factorsfm.result.reconstruction import LensFit, Reconstruction, RollingShutter
 from factorsfm.support.parallax import parallax
 from factorsfm.support.rotations import camera_centers
@@ -58,11 +58,10 @@ def assemble(
     kept = _usable_points(polished)
     observations = _observations_of(polished, images, kept)
     state, solved = polished.state, _solved_camera(polished, camera)
-    results = frame_results(polished, images, frames, solved, unit)
     general = polished.motion.kind is ShotKind.GENERAL
     result = Reconstruction(
         camera=solved,
-        frames=results,
+        frames=frame_results(polished, images, frames, solved, unit),
         points=state.bearing[kept] / state.inverse_distance[kept, None] * unit,
         colors=colors[polished.tracks[kept]],
         track_ids=polished.tracks[kept],
@@ -82,14 +81,8 @@ def assemble(
         options=options,
     )
     has_depth = any(image.tracks.depth is not None for image in images)
-    result.notes += notes_on(polished, has_depth)
-    if depth_kind is not None and not has_depth:
-        result.notes.append("The depth prior took no part: no frame that needed it has a usable depth map.")
-    if polished.lens is None and not lens_given:
-        result.notes.append(focal_origin_note(camera))
-    if result.shutter is not None:
-        result.notes.append(shutter_note(result.shutter, [frame.timestamp for frame in frames]))
-    result.notes += observability_notes(results)
+    guessed = camera if polished.lens is None and not lens_given else None
+    result.notes += result_notes(polished, result, guessed, depth_given=depth_kind is not None, has_depth=has_depth)
     if polished.datum is not None:
         _place(result, polished.datum)
     return result

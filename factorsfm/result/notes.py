@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from factorsfm.control.fit import ControlFit
 from factorsfm.lens.lens import LensEstimate
 from factorsfm.polish.polish import Polished
-from factorsfm.result.reconstruction import FrameResult, RollingShutter
+from factorsfm.result.reconstruction import FrameResult, Reconstruction, RollingShutter
 from factorsfm.support.status import ShotKind
 
 # Worth a sentence: the prior gives at least half of the information, or a virtual object may visibly drift.
@@ -23,29 +23,47 @@ _SHORTEST_STRETCH = 3  # frames
 _MOST_STRETCHES = 2  # sentences of each sort
 
 
-def notes_on(polished: Polished, has_depth: bool) -> list[str]:
-    notes: list[str] = []
-    motion = polished.motion
-    depths = "depths and their scale come from the prior alone" if has_depth else "depths are unknown without a prior"
-    if motion.kind is ShotKind.STATIC:
-        notes.append(
-            f"The camera is static: no frame moves by more than {motion.displacement_px:.2f} pixels; {depths}."
-        )
-    elif motion.kind is ShotKind.ROTATION:
-        notes.append(
-            "The camera only rotates: its translation is not observable from geometry and is reported as zero; "
-            f"{depths}."
-        )
+def result_notes(
+    polished: Polished, result: Reconstruction, guessed: pycolmap.Camera | None, *, depth_given: bool, has_depth: bool
+) -> list[str]:
+    """All notes on a result, the most important ones first.
+
+    Args:
+        guessed: the camera, where it was neither given nor estimated.
+        depth_given: whether there is a depth prior; has_depth: whether a frame has a depth map.
+    """
+    notes = _motion_notes(polished, has_depth)
     if polished.lens is not None:
         notes.append(lens_note(polished.lens))
     if polished.control is not None:
         notes += control_notes(polished.control)
     if polished.control_unused:
         notes.append("Control: not used, since a camera that stays in its place ties no lengths to the images.")
-    return notes
+    if depth_given and not has_depth:
+        notes.append("The depth prior took no part: no frame that needed it has a usable depth map.")
+    if guessed is not None:
+        notes.append(_focal_origin_note(guessed))
+    if result.shutter is not None:
+        notes.append(shutter_note(result.shutter, [frame.timestamp for frame in result.frames]))
+    return notes + observability_notes(result.frames)
+
+
+def _motion_notes(polished: Polished, has_depth: bool) -> list[str]:
+    """What a camera that does not translate leaves open."""
+    motion = polished.motion
+    depths = "depths and their scale come from the prior alone" if has_depth else "depths are unknown without a prior"
+    if motion.kind is ShotKind.STATIC:
+        return [f"The camera is static: no frame moves by more than {motion.displacement_px:.2f} pixels; {depths}."]
+    if motion.kind is ShotKind.ROTATION:
+        return [
+            "The camera only rotates: its translation is not observable from geometry and is reported as zero; "
+            f"{depths}."
+        ]
+    return []
 
 
 def lens_note(estimate: LensEstimate) -> str:
+    """What the shot says of an unknown lens."""
     focals, std = estimate.lens.focal, f"standard deviation {100 * estimate.focal_std.max():.1f} %"
     focal, zoom, held = float(np.median(focals)), "", not estimate.focal_std.any()
     if estimate.zoom_std is not None and len(focals) == 1:
@@ -73,7 +91,7 @@ def lens_note(estimate: LensEstimate) -> str:
     return f"{note}.{zoom}"
 
 
-def focal_origin_note(camera: pycolmap.Camera) -> str:
+def _focal_origin_note(camera: pycolmap.Camera) -> str:
     """Where a focal length comes from that was neither given nor estimated."""
     origin = "that of the EXIF data" if camera.has_prior_focal_length else "a guess"
     return (
@@ -83,6 +101,11 @@ def focal_origin_note(camera: pycolmap.Camera) -> str:
 
 
 def shutter_note(shutter: RollingShutter, timestamps: Sequence[float | None]) -> str:
+    """How a rolling shutter reads the images, and which moment the poses belong to.
+
+    Args:
+        timestamps: of the frames, seconds.
+    """
     way = ("top", "bottom") if shutter.along == "rows" else ("left", "right")
     first, last = way if shutter.readout > 0 else way[::-1]
     times = [time for time in timestamps if time is not None]
