@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import logging
-import shutil
 import time
 from collections.abc import Callable, Collection, Sequence
 from functools import partial
@@ -19,7 +18,7 @@ from factorsfm.cli.command import Command, add_method, add_output, count_of
 from factorsfm.cli.progress_line import ProgressLine
 from factorsfm.priors.depth import open_depth
 from factorsfm.priors.masks import open_masks
-from factorsfm.report.result_folder import check_directory, is_earlier_result, write_failure
+from factorsfm.report.result_folder import check_directory, is_earlier_result, remove_result, write_failure
 from factorsfm.support.errors import FactorsfmError, InputError, ReconstructionError
 from factorsfm.support.json_text import json_text
 from factorsfm.support.options import Options
@@ -150,7 +149,7 @@ def _remove_others(output: Path, jobs: Sequence[Job], unread: Collection[Video])
     for folder in output.absolute().glob("*/shot_*"):
         if folder not in kept and folder.parent.name not in unreadable and is_earlier_result(folder):
             logger.info("%s is removed: the video has no such shot any more", folder)
-            shutil.rmtree(folder)
+            remove_result(folder)
 
 
 class _Line:

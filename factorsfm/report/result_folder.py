@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -122,19 +123,14 @@ def _complete_or_nothing(directory: Path) -> Iterator[Path]:
 
 
 def _replace_entries(directory: Path, new: Path, replaced: Path) -> None:
-    """Exchange the entries of a result one by one; an error takes everything back.
-
-    Meanwhile summary.json says that the result is incomplete, and goes on saying so where the program is killed.
-    """
+    """Exchange the entries of a result one by one, summary.json last; an error takes everything back."""
     summary, before = directory / _SUMMARY, replaced / _SUMMARY
-    names = {*_ENTRIES, *_parts(directory), *(path.name for path in new.iterdir())} - {_SUMMARY}
+    names = {*_entries(directory), *(path.name for path in new.iterdir())} - {_SUMMARY}
     replaced.mkdir()
     if summary.exists():
         shutil.copyfile(summary, before)
-    marker = replaced / "incomplete.json"
-    marker.write_text(json_text(incomplete_summary()), encoding="utf-8")
     try:
-        marker.replace(summary)
+        _mark_incomplete(directory, new.parent)
         rename_all([*exchanged(directory, new, replaced, sorted(names)), (new / _SUMMARY, summary)])
     except BaseException:
         if before.exists():
@@ -142,6 +138,36 @@ def _replace_entries(directory: Path, new: Path, replaced: Path) -> None:
         else:
             summary.unlink(missing_ok=True)
         raise
+
+
+def remove_result(directory: Path) -> None:
+    """Remove a result; its folder stays if it holds other files.
+
+    Raises:
+        InputError: it cannot be removed.
+    """
+    try:
+        with tempfile.TemporaryDirectory(prefix=_REPLACING, dir=directory) as temporary:
+            _mark_incomplete(directory, Path(temporary))
+            for name in _entries(directory):
+                (directory / name).replace(Path(temporary) / name)
+            (directory / _SUMMARY).unlink()
+        if not any(directory.iterdir()):
+            directory.rmdir()
+    except OSError as error:
+        raise _unwritable(directory, error) from error
+
+
+def _mark_incomplete(directory: Path, temporary: Path) -> None:
+    """Let summary.json say that the result is incomplete, for as long as it is, also where the program is killed."""
+    marker = temporary / "incomplete.json"
+    marker.write_text(json_text(incomplete_summary()), encoding="utf-8")
+    marker.replace(directory / _SUMMARY)
+
+
+def _entries(directory: Path) -> list[str]:
+    """Names of what is there of a result, without summary.json."""
+    return [name for name in (*_ENTRIES, *_parts(directory)) if os.path.lexists(directory / name)]
 
 
 def _parts(directory: Path) -> list[str]:

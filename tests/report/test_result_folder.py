@@ -9,7 +9,7 @@ import pytest
 
 from factorsfm.batch.plan import Job, Method, Video
 from factorsfm.cli.main import main
-from factorsfm.report.result_folder import check_directory, write_failure, write_folder
+from factorsfm.report.result_folder import check_directory, remove_result, write_failure, write_folder
 from factorsfm.result.reading import read_result
 from factorsfm.result.reconstruction import Reconstruction
 from factorsfm.support.errors import InputError
@@ -135,6 +135,29 @@ def test_killed_at_any_step_the_folder_is_whole_or_says_that_it_is_incomplete(
     assert job(NEW, folder).is_done()
     assert [part.notes for part in parts_of(folder)] == [[NEW]]
     assert {path.name for path in folder.iterdir()} == FILES | {"mine"}  # nothing is left of those that were killed
+
+
+def test_a_result_is_removed_without_what_is_not_its_own(folder: Path, tmp_path: Path) -> None:
+    remove_result(folder)
+    assert contents(folder) == {"mine/notes.txt": b"precious"}
+    write_folder(result(EARLIER, 3, folder), tmp_path / "other")
+    remove_result(tmp_path / "other")
+    assert {path.name for path in tmp_path.iterdir()} == {"out"}
+
+
+def test_killed_while_it_removes_a_result_it_leaves_one_that_says_that_it_is_incomplete(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    interfering = Interfering(monkeypatch, lambda: os._exit(KILLED))
+    for step in range(1, 8):  # of seven entries
+        interfering.countdown = step
+        assert in_a_process(lambda: remove_result(folder)) == KILLED
+        interfering.countdown = NEVER
+        with pytest.raises(InputError, match="out is incomplete"):
+            read_result(folder)
+        write_folder(result(EARLIER, 3, folder), folder)
+        (folder / "picture.png").touch()
+    assert (folder / "mine" / "notes.txt").read_text() == "precious"
 
 
 def in_a_process(act: Callable[[], None]) -> int:
