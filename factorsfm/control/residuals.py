@@ -39,7 +39,7 @@ class Place:
     camera: bool = False
 
 
-class View:
+class ControlView:
     """A state as the residuals see it.
 
     Args:
@@ -96,7 +96,7 @@ class Item(Protocol):
     def unit(self) -> str: ...
     @property
     def sigma(self) -> float: ...
-    def linearized(self, view: View) -> Linearized: ...
+    def linearized(self, view: ControlView) -> Linearized: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +109,7 @@ class PositionItem:
     sigma: float
     unit: str = "m"
 
-    def linearized(self, view: View) -> Linearized:
+    def linearized(self, view: ControlView) -> Linearized:
         y, columns, derivative = view.known_place(self.place)
         return (y - self.known) / self.sigma, columns, derivative / self.sigma
 
@@ -124,7 +124,7 @@ class RotationItem:
     sigma: float  # degrees
     unit: str = "degrees"
 
-    def linearized(self, view: View) -> Linearized:
+    def linearized(self, view: ControlView) -> Linearized:
         world_from_cam = view.state.rotation[self.row].T
         off = self.known @ view.rotation @ world_from_cam
         vector = cv2.Rodrigues(off)[0][:, 0]
@@ -146,7 +146,7 @@ class MarkItem:
     sigma: float  # pixels
     unit: str = "px"
 
-    def linearized(self, view: View) -> Linearized:
+    def linearized(self, view: ControlView) -> Linearized:
         s, focal, one = view.state, float(view.state.focal[self.row]), np.ones(1)
         x, columns, _ = view.place(self.point)
         q = camera_points(s.rotation[self.row], s.translation[self.row], x[None], one)
@@ -167,7 +167,7 @@ class DistanceItem:
     sigma: float
     unit: str = "m"
 
-    def linearized(self, view: View) -> Linearized:
+    def linearized(self, view: ControlView) -> Linearized:
         (a, a_columns, by_a), (b, b_columns, by_b) = (view.place(end) for end in self.ends)
         length = float(np.linalg.norm(a - b))
         along = view.scale * (a - b) / max(length, 1e-12)
@@ -187,7 +187,7 @@ class HeightItem:
     sigma: float
     unit: str = "m"
 
-    def linearized(self, view: View) -> Linearized:
+    def linearized(self, view: ControlView) -> Linearized:
         center, columns, by_center = view.place(Place(self.row, camera=True))
         base, first, second = (view.place(point)[0] for point in self.points)
         a, b, e = first - base, second - base, center - base
@@ -207,7 +207,7 @@ class ControlTerm:
     """All control as a term of `BundleAdjustment`, with a Cauchy kernel on every item.
 
     Args:
-        start: (3, 3) rotation of the datum; anchor: (3,) its place in the world of the polish, see `View`.
+        start: (3, 3) rotation of the datum; anchor: (3,) its place in the world of the polish, see `ControlView`.
         free: (7 + 3 p,) which variables of the datum and of the marked points are estimated.
         kernel: scale of the Cauchy kernel, standard deviations.
     """
@@ -224,8 +224,8 @@ class ControlTerm:
         self.free = free
         self._start, self._anchor = start, anchor
 
-    def view(self, state: State) -> View:
-        return View(state, self._start, self._anchor)
+    def view(self, state: State) -> ControlView:
+        return ControlView(state, self._start, self._anchor)
 
     def residuals(self, state: State) -> list[Array]:
         """Of every item, in standard deviations."""

@@ -20,6 +20,7 @@ from factorsfm.control.known import KnownDistance, KnownHeight, KnownPose, Locat
 from factorsfm.control.residuals import (
     DATUM,
     ControlTerm,
+    ControlView,
     DistanceItem,
     HeightItem,
     Item,
@@ -27,7 +28,6 @@ from factorsfm.control.residuals import (
     Place,
     PositionItem,
     RotationItem,
-    View,
 )
 from factorsfm.control.world_alignment import Correspondences, start_datum
 from factorsfm.mapping.triangulation import triangulate
@@ -353,7 +353,7 @@ def _residual(item: Item, residual: Array) -> ControlResidual:
     return ControlResidual(item.name, item.unit, sigmas * item.sigma, item.sigma, sigmas, sigmas > _CONTRADICTION)
 
 
-def _pose_covariance(marginals: Marginals, state: State, view: View) -> Array:
+def _pose_covariance(marginals: Marginals, state: State, view: ControlView) -> Array:
     """(k, 6, 6) of the poses in the control's world (GTSAM's convention), in the polish's unit of length.
 
     A change of the datum turns and moves all cameras: ``R (s x) + T`` by its variables, seen from the camera.
@@ -372,7 +372,7 @@ def _pose_covariance(marginals: Marginals, state: State, view: View) -> Array:
     return blocks
 
 
-def _by_size(state: State, view: View) -> Array:
+def _by_size(state: State, view: ControlView) -> Array:
     """(7 + 3 p,) by how much datum and marked points change with the logarithm of the scene's size."""
     by_size = np.zeros(len(state.control))
     by_size[3:6] = view.scale * view.rotation @ view.anchor

@@ -17,7 +17,7 @@ from factorsfm.frames.frame import Frame
 from factorsfm.frames.reading import read_frames
 from factorsfm.frames.unordered import read_images
 from factorsfm.imagesets.joint_adjustment import extended, local_pose
-from factorsfm.imagesets.joint_problem import View
+from factorsfm.imagesets.joint_problem import MatchedImage
 from factorsfm.imagesets.mapper import SetMapper, for_image_sets
 from factorsfm.imagesets.photo_folder import pixel_digest, work_folder, write_once
 from factorsfm.result.image_sources import AddedImages, ImageSource, added_images, image_sources
@@ -91,9 +91,9 @@ class _Extension:
     def __init__(self, base: Reconstruction, folder: Path, refine: bool) -> None:
         self._base, self._folder, self._refine = base, folder, refine
         self._frames = [replace(frame) for frame in base.frames]
-        self._known: list[View] = []
+        self._known: list[MatchedImage] = []
         self._absent: set[int] = set()  # rows of known images that cannot be matched: turned ones, and no files
-        self._new: list[View] = []
+        self._new: list[MatchedImage] = []
         self._added = added_images(base.options)
         # The world in which everything is solved: the first camera, and a median distance of 1.
         first = base.registered[0].cam_from_world
@@ -186,12 +186,12 @@ class _Extension:
             return ""
         return f"{width}x{height} pixels, another format than {camera.width}x{camera.height} of the camera"
 
-    def _view(self, image: Frame, frame: FrameResult, position: int) -> View:
+    def _view(self, image: Frame, frame: FrameResult, position: int) -> MatchedImage:
         file = f"{position:06d}-{pixel_digest(image.image)}.png"
         write_once(self._folder / "images" / file, image.image)
         none = np.zeros((0, 2))
         size = image.image.shape[1], image.image.shape[0]
-        return View(frame, position, file, size, np.zeros(0, np.int64), none, np.zeros((0, 3), np.uint8))
+        return MatchedImage(frame, position, file, size, np.zeros(0, np.int64), none, np.zeros((0, 3), np.uint8))
 
     # --- steps --------------------------------------------------------------------------------------------------
 
@@ -222,7 +222,7 @@ class _Extension:
                 result.notes.append(f"{view.frame.name} could not be registered: {view.frame.message}.")
         return result
 
-    def _match(self, views: list[View]) -> list[ImageTracks]:
+    def _match(self, views: list[MatchedImage]) -> list[ImageTracks]:
         """Tracks of all images; their pixels and colours are left in the views."""
         camera = self._base.camera
         cameras = []

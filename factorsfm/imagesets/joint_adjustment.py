@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from factorsfm.adjustment.marginals import in_scene_unit
 from factorsfm.adjustment.noise import coordinate_sigma
 from factorsfm.camera.projection import pixels_from_normalized
-from factorsfm.imagesets.joint_problem import Observed, Solved, View, observed_together, solve
+from factorsfm.imagesets.joint_problem import MatchedImage, Observed, Solved, observed_together, solve
 from factorsfm.imagesets.mapper import SetMapper
 from factorsfm.polish.observability import camera_observability, pose_blocks
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
@@ -29,7 +29,7 @@ _INLIER_SIGMAS = 8.0  # an observation with a larger reprojection error is no in
 def extended(
     base: Reconstruction,
     frames: list[FrameResult],
-    views: Sequence[View],
+    views: Sequence[MatchedImage],
     mapper: SetMapper,
     local: Similarity,
     *,
@@ -81,7 +81,7 @@ def _points(
     return points
 
 
-def _colors(views: Sequence[View], ids: Index) -> NDArray[np.uint8]:
+def _colors(views: Sequence[MatchedImage], ids: Index) -> NDArray[np.uint8]:
     """(n, 3) colours of the mapped tracks."""
     colors = np.zeros((len(ids), 3), np.uint8)
     for view in views:

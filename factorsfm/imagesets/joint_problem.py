@@ -29,7 +29,7 @@ _OPTIONS = replace(PolishOptions(), iterations=30)
 
 
 @dataclass(slots=True)
-class View:
+class MatchedImage:
     """An image that takes part.
 
     Attributes:
@@ -92,7 +92,7 @@ class Solved:
 
 
 def observed_together(
-    base: Reconstruction, views: Sequence[View], ids: Index, old: Set[int], new: Set[int]
+    base: Reconstruction, views: Sequence[MatchedImage], ids: Index, old: Set[int], new: Set[int]
 ) -> Observed:
     """All observations in registered frames: those of the result, and those of tracks that are none of its points.
 
@@ -120,7 +120,7 @@ def observed_together(
     return found.only(np.isin(found.frame, [*old, *new]))
 
 
-def _same_points(base: Reconstruction, views: Sequence[View], ids: Index, old: Set[int]) -> dict[int, int]:
+def _same_points(base: Reconstruction, views: Sequence[MatchedImage], ids: Index, old: Set[int]) -> dict[int, int]:
     """Rows of the mapped tracks (in `ids`) that are points of the result: the same keypoints of its images."""
     same: dict[int, int] = {}
     for view in views:

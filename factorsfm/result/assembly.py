@@ -18,7 +18,7 @@ from factorsfm.lens.rolling_shutter import Shutter
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.polish.polish import Polished
 from factorsfm.priors.depth_map import DepthKind
-from factorsfm.result.frame_results import SeenFrame, frame_results
+from factorsfm.result.frame_results import SourceFrame, frame_results
 from factorsfm.result.notes import result_notes
 from factorsfm.result.reconstruction import LensFit, Reconstruction, RollingShutter
 from factorsfm.support.parallax import parallax
@@ -35,7 +35,7 @@ _LEAST_INVERSE_DISTANCE, _LEAST_DEPTH = 1e-3, 1e-6  # units of the polish; a poi
 def assemble(
     polished: Polished,
     images: Sequence[MappedImage],
-    frames: Sequence[SeenFrame],
+    frames: Sequence[SourceFrame],
     colors: NDArray[np.uint8],
     camera: pycolmap.Camera,
     *,

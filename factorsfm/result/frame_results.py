@@ -18,7 +18,7 @@ _INLIER_SIGMAS = 8.0  # an observation with a larger reprojection error is no in
 _MAD_TO_SIGMA = 1.4826
 
 
-class SeenFrame(Protocol):
+class SourceFrame(Protocol):
     """What the result needs to know of a frame of the source."""
 
     @property
@@ -32,7 +32,7 @@ class SeenFrame(Protocol):
 def frame_results(
     polished: Polished,
     images: Sequence[MappedImage],
-    frames: Sequence[SeenFrame],
+    frames: Sequence[SourceFrame],
     camera: pycolmap.Camera,
     unit: float,
 ) -> list[FrameResult]:
