@@ -81,11 +81,13 @@ def assert_readable(result: factorsfm.Reconstruction, folder: Path) -> None:
     for frame in result.registered:
         (pose,) = (poses[name] for name in poses if Path(name).stem == frame.name)
         np.testing.assert_allclose(pose, frame.cam_from_world.matrix(), atol=1e-9)
-    np.testing.assert_allclose(np.sort(reprojection_errors(model)), np.sort(result.observation_error), atol=1e-4)
+    np.testing.assert_allclose(
+        np.sort(reprojection_errors(model)), np.sort(result.observation_error), rtol=0.0, atol=3e-6
+    )
 
     trajectory = np.loadtxt(folder / "trajectory.tum")
     np.testing.assert_array_equal(trajectory[:, 0], [frame.index for frame in result.registered])
-    np.testing.assert_allclose(trajectory[:, 1:4], result.camera_centers(), atol=1e-6)
+    np.testing.assert_allclose(trajectory[:, 1:4], result.camera_centers(), rtol=0.0, atol=1e-10)
     summary = json.loads((folder / "summary.json").read_text())
     assert (summary["registered"], summary["points"]) == (len(result.registered), len(result.points))
     assert summary["parallax"] == pytest.approx(result.parallax)
@@ -137,4 +139,4 @@ def test_a_fade_in_spoils_nothing(shared_data: Path, shared_models: Path, tmp_pa
     more = factorsfm.add_images(tmp_path / "result", [clip[5]])
     added = more.frames[-1].cam_from_world
     offset = (added * own[5].cam_from_world.inverse()).matrix() - np.eye(3, 4)
-    assert np.abs(offset).max() < 0.003
+    assert 5e-5 < np.abs(offset).max() < 8e-4

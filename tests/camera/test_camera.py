@@ -57,7 +57,7 @@ def test_pixels_agree_with_opencv_and_return(tmp_path, model):
     camera = read_camera(write(tmp_path / "camera.json", content))
     xy = np.random.default_rng(0).uniform([-0.5, -0.5], [639.5, 479.5], (200, 2))
     uv = normalized_from_pixels(camera, xy)
-    np.testing.assert_allclose(pixels_from_normalized(camera, uv), xy, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(pixels_from_normalized(camera, uv), xy, rtol=0, atol=2e-8)
 
     fx, fy, cx, cy = (camera_to_json(camera)[key] for key in ("fx", "fy", "cx", "cy"))
     distortion = {
@@ -68,7 +68,7 @@ def test_pixels_agree_with_opencv_and_return(tmp_path, model):
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
     rays = np.column_stack([uv, np.ones(len(uv))])
     projected, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, np.array(distortion[model], float))
-    np.testing.assert_allclose(projected[:, 0], xy, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(projected[:, 0], xy, rtol=0, atol=2e-8)
 
 
 def test_no_points_stay_no_points():

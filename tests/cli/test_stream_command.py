@@ -143,9 +143,9 @@ def test_going_on_from_a_snapshot(tmp_path: Path, stream: Run, capsys: pytest.Ca
     assert stream("--resume", snapshot, output="resumed") == 0
     assert stream(output="whole") == 0
     whole, resumed = trajectory(tmp_path / "whole"), trajectory(tmp_path / "resumed")
-    np.testing.assert_allclose(resumed, whole, atol=1e-6)
+    np.testing.assert_allclose(resumed, whole, rtol=0.0, atol=1e-9)
     assert stream("--frames", ":5", "--resume", snapshot, output="nothing_new") == 0
-    np.testing.assert_allclose(trajectory(tmp_path / "nothing_new"), trajectory(tmp_path / "out"), atol=1e-6)
+    np.testing.assert_allclose(trajectory(tmp_path / "nothing_new"), trajectory(tmp_path / "out"), rtol=0.0, atol=1e-9)
     capsys.readouterr()
     assert stream("--resume", snapshot, "--preset", "paper", output="other") == 2
     assert_error(capsys.readouterr(), "--preset default, not paper")
@@ -169,7 +169,7 @@ def test_a_live_source_goes_on(tmp_path: Path, stream: Run, monkeypatch: pytest.
             monkeypatch.setattr("sys.stdin", file)
             assert stream("--raw", "320x180:bgr24", *more, tmp_path / "state", source="-", output=f"out {name}") == 0
     assert trajectory(tmp_path / "out second")[:, 0].tolist() == list(range(FRAMES))
-    np.testing.assert_allclose(trajectory(tmp_path / "out second"), trajectory(tmp_path / "whole"), atol=1e-6)
+    np.testing.assert_allclose(trajectory(tmp_path / "out second"), trajectory(tmp_path / "whole"), rtol=0.0, atol=1e-9)
 
 
 def test_a_snapshot_that_cannot_be_written_does_not_end_the_stream(
@@ -299,4 +299,4 @@ def test_killed_it_goes_on_from_the_last_snapshot(tmp_path: Path, given: list[st
     command = ["stream", str(folder), "--output", str(tmp_path / "out"), *again]
     assert main([*command, "--resume", str(snapshot)]) == 0
     assert main(["reconstruct", str(folder), "--output", str(tmp_path / "once"), *given]) == 0
-    np.testing.assert_allclose(trajectory(tmp_path / "out"), trajectory(tmp_path / "once"), atol=1e-6)
+    np.testing.assert_allclose(trajectory(tmp_path / "out"), trajectory(tmp_path / "once"), rtol=0.0, atol=1e-9)

@@ -56,7 +56,7 @@ def test_a_shot_has_no_cut():
     assert [update.shot for update in updates] == [0] * LENGTH
     assert [update.starts for update in updates] == [True] + [False] * (LENGTH - 1)
     assert np.isnan(updates[0].dissimilarity)
-    assert all(0 <= update.dissimilarity < 0.04 for update in updates[1:])
+    assert all(0 <= update.dissimilarity < 0.004 for update in updates[1:])
     assert [update.reason for update in updates[:2]] == ["first frame that shows something", ""]
 
 

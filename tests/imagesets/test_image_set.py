@@ -110,7 +110,7 @@ def test_wide_baselines_with_wrong_matches_in_any_order() -> None:
 def test_without_noise_the_solution_is_exact() -> None:
     ring = Ring(cameras=8, points=600)
     result = solve(ring.tracks(noise_px=0.0))
-    assert ring.errors(result.state.rotation, result.state.translation).ate.max() < 1e-6
+    assert ring.errors(result.state.rotation, result.state.translation).ate.max() < 1e-13
 
 
 def with_depth(ring: Ring, tracks: list[ImageTracks], scale: float, shift: float) -> list[ImageTracks]:
@@ -156,7 +156,7 @@ def test_an_image_that_the_map_contradicts_is_registered_again() -> None:
     assert "contradicts" in spoiled.message
     mapper._grow(None)
     assert registered(mapper) == list(range(len(mapper.images)))
-    assert np.linalg.norm(spoiled.pose[0] @ sound[0].T - np.eye(3)) < 0.01
+    assert np.linalg.norm(spoiled.pose[0] @ sound[0].T - np.eye(3)) < 3e-4
 
 
 def test_the_part_with_most_images_is_kept_and_the_others_are_told_why() -> None:
@@ -191,7 +191,7 @@ def test_parts_without_common_tracks_are_maps_of_their_own() -> None:
     for part, ring, first in zip(parts, (rings[1], rings[0], rings[3]), (4, 0, 13), strict=True):
         poses = [image.pose for image in part.images[first : first + len(ring.rotation)]]
         errors = ring.errors(np.array([r for r, _ in poses]), np.array([t for _, t in poses]))
-        assert errors.ate.max() < 0.02
+        assert 3e-4 < errors.ate.max() < 0.008
         assert "a part of 2 images" in part.images[11].message  # too small for one of its own
 
 
@@ -209,7 +209,7 @@ def test_what_no_pose_joins_to_the_map_is_started_anew() -> None:
     assert registered(second) == [7, 8, 9, 10]
     assert "of 15 needed inliers" in first.images[7].message
     poses = [image.pose for image in second.images[7:]]
-    assert small.errors(np.array([r for r, _ in poses]), np.array([t for _, t in poses])).ate.max() < 0.02
+    assert small.errors(np.array([r for r, _ in poses]), np.array([t for _, t in poses])).ate.max() < 0.004
 
 
 def test_an_image_of_wrong_matches_is_not_registered() -> None:
@@ -228,7 +228,7 @@ def test_a_guessed_focal_length_is_corrected_with_the_map() -> None:
     guess = 1.2 * FOCAL
     tracks = [replace(t, camera=with_focal(t.camera, guess)) for t in ring.tracks()]
     result = solve(tracks, Options(lens="focal"), guess)
-    assert result.state.focal[0] == pytest.approx(FOCAL, rel=0.003)
+    assert result.state.focal[0] == pytest.approx(FOCAL, rel=2e-4)
     assert np.median(ring.errors(result.state.rotation, result.state.translation).ate) < 3e-3
 
 
@@ -255,7 +255,7 @@ def test_small_parallax_is_solved_with_and_without_a_prior(with_depth: bool, cap
     r, t = result.state.rotation, result.state.translation
     estimate = r.transpose(0, 2, 1), -np.einsum("kji,kj->ki", r, t)
     errors = trajectory_errors(*estimate, np.tile(np.eye(3), (5, 1, 1)), centers)
-    assert np.median(errors.ate) < 0.004  # of a path of about 0.1
+    assert 3e-5 < np.median(errors.ate) < 4e-4  # of a path of about 0.1
     assert (result.prior is not None) == with_depth
 
 
@@ -355,8 +355,8 @@ def test_odd_files_are_told_and_do_not_stop_the_rest(
     expected = pose_arrays([truth[Path(frame.name).stem] for frame in posed])
     length = np.linalg.norm(expected[1][:, None] - expected[1], axis=2).max()
     errors = trajectory_errors(*estimate, *expected)
-    assert errors.ate.max() < 0.01 * length
-    assert errors.r_rpe.max() < 0.1
+    assert 5e-5 * length < errors.ate.max() < 6e-4 * length
+    assert 1e-3 < errors.r_rpe.max() < 0.015
 
     assert frames["cut.jpg"].status is frames["text.jpg"].status is FrameStatus.UNUSABLE
     assert frames["cut.jpg"].message == "it is truncated"
@@ -416,7 +416,7 @@ def test_images_of_two_cameras(tmp_path: Path) -> None:
     for frame, other in zip(result.frames, again.frames, strict=True):
         assert again.camera_of(other).params.tolist() == result.camera_of(frame).params.tolist()
     # The errors in the file are those of the lenses in the file.
-    assert np.median(again.observation_error) == pytest.approx(np.median(result.observation_error), rel=0.02)
+    assert np.median(again.observation_error) == pytest.approx(np.median(result.observation_error), rel=1e-4)
     export(again, tmp_path / "splats", format="nerfstudio", options=ExportOptions(footage=tmp_path))
     written = json.loads((tmp_path / "splats" / "transforms.json").read_text())
     assert "w" not in written
@@ -433,8 +433,8 @@ def test_cameras_far_apart_determine_the_principal_point(tmp_path: Path) -> None
         images.append(image[20:320, 30:430])  # the middle of the lens is at (190, 145)
     result = reconstruct(images, depth=None, unordered=True)
     assert result.parallax > 0.3
-    assert result.camera.mean_focal_length() == pytest.approx(room_camera(440, 330).focal_length_x, rel=0.02)
-    assert 0.0 < abs(result.camera.principal_point_x - 190) < 4  # the guess is off by 10
+    assert result.camera.mean_focal_length() == pytest.approx(room_camera(440, 330).focal_length_x, rel=5e-4)
+    assert abs(result.camera.principal_point_x - 190) < 1.2  # the guess is off by 10
     assert abs(result.camera.principal_point_y - 145) < 3
     assert result.lens is not None
     assert result.lens.cx_std is not None
@@ -532,7 +532,7 @@ def test_two_scenes_make_two_results(shot: RenderedShot, tmp_path: Path, capsys:
     expected = pose_arrays(shot.cam_from_world[:3])
     centers = pose_arrays([frame.cam_from_world for frame in second.registered[:3]])[1]
     sides, true = (np.linalg.norm(c - np.roll(c, 1, 0), axis=1) for c in (centers, expected[1]))
-    np.testing.assert_allclose(sides / sides.sum(), true / true.sum(), atol=0.02)  # a triangle has no handedness
+    np.testing.assert_allclose(sides / sides.sum(), true / true.sum(), atol=1e-4)  # a triangle has no handedness
 
     second.write(tmp_path / "out")  # a result of one part leaves nothing of the other
     assert not (tmp_path / "out" / "part-002").exists()

@@ -62,9 +62,9 @@ def test_the_numbers_are_those_of_the_updates(recorded):
     np.testing.assert_allclose([v[0] for v in share.values()], [f.observability.prior_share for f in result.frames])
     place = series(rows, "/world/camera", "Transform3D:translation")
     centers = [update.cam_from_world.inverse().translation for update in updates]
-    np.testing.assert_allclose([value[0] for value in place.values()], centers, atol=1e-5)
+    np.testing.assert_allclose([value[0] for value in place.values()], centers, rtol=0.0, atol=1e-8)
     points = series(rows, "/world/polished/points", "Points3D:positions")
-    np.testing.assert_allclose(points[FRAMES - 1], result.points, atol=1e-4)
+    np.testing.assert_allclose(points[FRAMES - 1], result.points, rtol=0.0, atol=1e-6)
 
 
 def test_nothing_is_shown_unless_asked_for():
