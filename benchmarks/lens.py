@@ -32,7 +32,6 @@ from factorsfm.evaluation.metrics import auc, relative_pose_errors
 from factorsfm.evaluation.readers import read_shot
 from factorsfm.evaluation.truth import Shot
 from factorsfm.lens.camera_model import with_distortion
-from factorsfm.lens.lens import Lens, renormalized
 from factorsfm.support.options import PolishOptions
 
 _SEVEN, _TWO = ("d01", "d03", "d04", "d05", "d07", "d08", "d10"), ("d04", "d07")
@@ -135,8 +134,8 @@ def focal_of_true_poses(known: factorsfm.Reconstruction, shot: Shot) -> float:
     focal = shot.camera.mean_focal_length()
     translation *= size / max(true_size, 1e-9) / unit
     state = State(rotation, translation, points / distance[:, None], unit / distance, np.log([focal]))
-    xy = normalized_from_pixels(shot.camera, known.observation_xy[order])
-    observations = Observations(np.searchsorted(frames, known.observation_frame[order]), point, xy)
+    pixels = focal * normalized_from_pixels(shot.camera, known.observation_xy[order])
+    observations = Observations(np.searchsorted(frames, known.observation_frame[order]), point, pixels)
     held, options, sigma = np.ones(len(frames), bool), PolishOptions(tolerance=1e-6), 3.0
     for free in (False, True, True, True):
         adjustment = BundleAdjustment(
@@ -144,10 +143,7 @@ def focal_of_true_poses(known: factorsfm.Reconstruction, shot: Shot) -> float:
         )
         state = adjustment.solve()
         sigma = coordinate_sigma(adjustment.reprojection_errors())
-        after = Lens(np.exp(state.log_focal))
-        observations = renormalized(observations, Lens(np.array([focal])), after, state.group)
-        focal = float(after.focal[0])
-    return focal
+    return float(np.exp(state.log_focal[0]))
 
 
 def pose_auc(result: factorsfm.Reconstruction, shot: Shot) -> str:

@@ -37,7 +37,12 @@ class Problem:
     def of_frame(self, frame):
         """Points (ids) that a frame observes and their normalised coordinates."""
         mine = self.observations.frame == frame
-        return self.observations.point[mine], self.observations.xy[mine]
+        return self.observations.point[mine], self.xy[mine]
+
+    @property
+    def xy(self):
+        """(m, 2) undistorted normalised coordinates of the observations, of the true lens without distortion."""
+        return self.observations.pixels / self.focal
 
     def depth(self, frame, ids):
         return (self.points[ids] @ self.truth.rotation[frame].T + self.truth.translation[frame])[:, 2]
@@ -62,13 +67,18 @@ def make_problem(motion, *, frames=10, points=100, parallax=0.05, noise_px=0.0, 
         inverse_distance=1 / distance,
         log_focal=np.log([focal]),
     )
-    observations = Observations(np.tile(np.arange(frames), n), np.repeat(np.arange(n), frames), xy.reshape(-1, 2))
+    frame, point = np.tile(np.arange(frames), n), np.repeat(np.arange(n), frames)
+    observations = Observations(frame, point, focal * xy.reshape(-1, 2))
     return Problem(truth, points, observations, focal, noise_px)
+
+
+def pinhole(focal):
+    return pycolmap.Camera(model="SIMPLE_PINHOLE", width=640, height=360, params=[focal, 320.0, 180.0])
 
 
 def tracks_at(position, ids, xy, depth=None, *, focal=1.0):
     """Tracks of an image at normalised coordinates (n, 2), seen by a pinhole."""
-    camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=640, height=360, params=[focal, 320.0, 180.0])
+    camera = pinhole(focal)
     return ImageTracks(position, ids, pixels_from_normalized(camera, xy), camera, depth)
 
 
@@ -79,13 +89,16 @@ def image_depth(problem, frame, ids, *, scale=1.0, shift=0.0, noise=0.0, seed=0)
     return ImageDepth(value, np.ones(len(ids)), unit=1.0)
 
 
-def mapped_images(problem, state, *, guided=(), **prior):
-    """The frames as the mapper sees them, at the poses of `state`; `guided` ones carry a prior (see `image_depth`)."""
-    images = []
+def mapped_images(problem, state, *, guess=1.0, guided=(), **prior):
+    """The frames as the mapper sees them, at the poses of `state`; `guided` ones carry a prior (see `image_depth`).
+
+    `guess`: focal length of the mapper's cameras over the true one, one or one for each frame.
+    """
+    images, guess = [], np.broadcast_to(guess, problem.frames)
     for k in range(problem.frames):
         ids, xy = problem.of_frame(k)
         depth = image_depth(problem, k, ids, **prior) if k in guided else None
-        tracks = tracks_at(k, ids, xy, depth, focal=problem.focal)
+        tracks = tracks_at(k, ids, xy / guess[k], depth, focal=guess[k] * problem.focal)
         images.append(MappedImage(tracks, FrameStatus.REGISTERED, "", state.rotation[k], state.translation[k]))
     return images
 

@@ -38,7 +38,7 @@ class Problem:
 
     Attributes:
         rotation (k, 3, 3), translation (k, 3), points (n, 3): the start, the first camera exact.
-        observations: of the points, normalised; focal: pixels.
+        observations: of the points; focal: pixels.
         true_rotations (k, 3, 3), true_centers (k, 3): world_from_cam.
     """
 
@@ -57,7 +57,8 @@ def batch_problem(frames: int, points: int) -> Problem:
     observed = scene.observe(PIXEL_SIGMA)
     frame = np.concatenate([np.full(len(ids), k) for k, (ids, _) in enumerate(observed)])
     point = np.concatenate([ids for ids, _ in observed])
-    xy = normalized_from_pixels(scene.camera, np.concatenate([pixels for _, pixels in observed]))
+    focal = float(scene.camera.focal_length_x)
+    pixels = focal * normalized_from_pixels(scene.camera, np.concatenate([pixels for _, pixels in observed]))
     order = np.argsort(point, kind="stable")
     order = order[(np.bincount(point) >= _TRACK_LENGTH)[point[order]]]
     kept, row = np.unique(point[order], return_inverse=True)
@@ -69,8 +70,8 @@ def batch_problem(frames: int, points: int) -> Problem:
         rotations.transpose(0, 2, 1),
         translation,
         scene.points[kept] * (1.0 + 0.1 * rng.standard_normal((len(kept), 1))),
-        Observations(frame[order], row, xy[order]),
-        float(scene.camera.focal_length_x),
+        Observations(frame[order], row, pixels[order]),
+        focal,
         rotations,
         centers,
     )
@@ -126,7 +127,7 @@ def _solve_pycolmap(problem: Problem) -> tuple[Array, Array, int]:
     for k, chosen in enumerate(rows):
         position[chosen] = np.arange(len(chosen))
         image = pycolmap.Image(name=str(k), camera_id=1, image_id=k + 1)
-        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in focal * observations.xy[chosen]])
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in observations.pixels[chosen]])
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(problem.rotation[k]), problem.translation[k])
         model.add_image_with_trivial_frame(image, pose)
     ends = np.flatnonzero(np.diff(observations.point, append=-1)) + 1
@@ -156,7 +157,7 @@ def _solve_gtsam(problem: Problem) -> tuple[Array, Array, int]:
     noise = gtsam.noiseModel.Robust.Create(kernel, gtsam.noiseModel.Isotropic.Sigma(2, PIXEL_SIGMA))
     graph, values, ordering = gtsam.NonlinearFactorGraph(), gtsam.Values(), gtsam.Ordering()
     for i, (frame, point) in enumerate(zip(observations.frame.tolist(), observations.point.tolist(), strict=True)):
-        pixel = focal * observations.xy[i]
+        pixel = observations.pixels[i]
         graph.add(gtsam.GenericProjectionFactorCal3_S2(pixel, noise, X(frame), L(point), lens))
     for i, xyz in enumerate(problem.points):
         values.insert(L(i), xyz)

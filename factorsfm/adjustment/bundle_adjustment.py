@@ -18,6 +18,7 @@ from factorsfm.adjustment.columns import Columns
 from factorsfm.adjustment.depth_term import AffinePrior, DepthTerm
 from factorsfm.adjustment.elimination import Block, Elimination, Normal, reduced
 from factorsfm.adjustment.marginals import Marginals, tangent_basis
+from factorsfm.adjustment.noise import block_inflation
 from factorsfm.adjustment.observations import Observations, PriorObservations
 from factorsfm.adjustment.problem import NOTHING, POSES, CameraTerm, ErrorModel, Free, Known
 from factorsfm.adjustment.semidefinite import conditioned, covariance_of, solution
@@ -82,7 +83,7 @@ class BundleAdjustment:
         self.free_optics = np.nonzero(estimated[self.columns.optics])[0]
         self._tracks = TrackTerm(
             state, observations, errors, options.kernel,
-            bends=known.lens is not None, optics=free.focal or known.lens is not None,
+            focal=free.focal, lens=known.lens is not None,
         )  # fmt: skip
         self._depth = DepthTerm(prior, options.kernel) if prior is not None else None
         self._camera_terms: list[CameraTerm] = known.terms + ([AffinePrior(prior)] if prior is not None else [])
@@ -125,6 +126,11 @@ class BundleAdjustment:
     def observation_costs(self) -> Array:
         """(m,) robust cost of each observation; noise alone costs about one."""
         return self._tracks.costs(self.state)
+
+    def error_inflation(self) -> float:
+        """By how much the errors of neighbouring tracks repeat each other, see `block_inflation`."""
+        place = self.state.normalized(self.observations)
+        return block_inflation(self.reprojection_vectors(), self.observations.frame, place)
 
     def prior_residuals(self) -> Array:
         """(m,) residuals of the prior (unit of its inverse depth)."""

@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.adjustment.observations import Observations
-
 Array = NDArray[np.float64]
 
 FIRST_SIGMA_PX = 0.25  # of a tracked point, until it is measured
@@ -25,17 +23,17 @@ def coordinate_sigma(errors: Array) -> float:
     return max(typical_sigma(errors), SMALLEST_SIGMA_PX)
 
 
-def block_inflation(residual: Array, observations: Observations) -> float:
+def block_inflation(residual: Array, frame: NDArray[np.int64], place: Array) -> float:
     """By how much errors of neighbouring tracks in neighbouring frames repeat each other: a factor on the variance.
 
     In a block of the image and of time, independent errors add up to the root of their number.
 
     Args:
-        residual: (m, 2) predicted minus observed position of each observation.
+        residual: (m, 2) predicted minus observed position; frame: (m,) in which; place: (m, 2) normalised coordinates.
     """
-    o, inlier = observations, _inliers(residual)
+    inlier = _inliers(residual)
     across, down, frames = _BLOCKS
-    key = (o.frame // frames) * down * across + image_cells(o.xy, across, down)
+    key = (frame // frames) * down * across + image_cells(place, across, down)
     key, residual = key[inlier], residual[inlier]
     sums = [np.bincount(key, residual[:, axis]) for axis in range(2)]
     power = float((residual**2).sum())

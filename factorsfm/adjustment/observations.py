@@ -1,4 +1,4 @@
-"""The polish in data: what is measured, and the variables that explain it."""
+"""What is measured: observations of tracks, how they move during the readout, and values of the depth prior."""
 
 from __future__ import annotations
 
@@ -48,13 +48,13 @@ class Observations:
 
     Attributes:
         frame, point: (m,) indices.
-        xy: (m, 2) undistorted normalised image coordinates.
+        pixels: (m, 2) relative to the principal point, before anything that `State.lens` models is taken away.
         sweep: how each moves while the image is read out; None where that is not known.
     """
 
     frame: Index
     point: Index
-    xy: Array
+    pixels: Array
     sweep: Sweep | None = None
 
     @property
@@ -79,7 +79,7 @@ class Observations:
         return Observations(
             self.frame[rows] if frame is None else frame,
             self.point[rows] if point is None else point,
-            self.xy[rows],
+            self.pixels[rows],
             None if self.sweep is None else self.sweep.of(rows),
         )
 

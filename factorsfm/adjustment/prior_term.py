@@ -17,11 +17,9 @@ from factorsfm.adjustment.prior_weight import (
     field_grid,
     measure_weight,
     sample_points,
-    usual_weight,
 )
-from factorsfm.adjustment.problem import ErrorModel, Free
+from factorsfm.adjustment.problem import POSES, ErrorModel, Free
 from factorsfm.adjustment.state import State
-from factorsfm.adjustment.track_errors import TrackErrors
 from factorsfm.priors.affine import KNOWN_SHIFT_SIGMA, SCALE_SIGMA, SHIFT_SIGMA, fit_affine
 from factorsfm.support.options import PolishOptions
 from factorsfm.tracks.image_tracks import ImageTracks
@@ -100,37 +98,17 @@ def weigh_prior(
     return WeighedPrior(weight, values.rows, scale, shift, inflation)
 
 
-def usual_prior(
-    state: State,
-    observations: Observations,
-    tracks: Index,
-    images: Sequence[ImageTracks],
-    affines: Sequence[tuple[float, float] | None],
-) -> WeighedPrior | None:
-    """The prior as networks usually are, where the shot has not shown yet how good this one is.
-
-    Args:
-        affines: scale and shift of each image as far as they are known.
-    """
-    values = prior_values(images, observations, tracks)
-    if values is None:
-        return None
-    scale, shift = np.array([affines[row] or (1.0, 0.0) for row in values.rows]).T
-    return WeighedPrior(usual_weight(direction_angles(state.bearing)), values.rows, scale, shift, 1.0)
-
-
 def joint_problem(
     state: State,
     observations: Observations,
     tracks: Index,
     images: Sequence[ImageTracks],
     weighed: WeighedPrior,
-    sigma: float,
+    errors: ErrorModel,
     options: PolishOptions,
-    fixed: NDArray[np.bool_] | None = None,
-    track_errors: TrackErrors | None = None,
+    free: Free = POSES,
 ) -> tuple[BundleAdjustment, PriorPart]:
-    """Tracks and the prior at its weight; `fixed` and `track_errors` as in `BundleAdjustment`."""
+    """Tracks and the prior at its weight; `errors`, `options` and `free` as in `BundleAdjustment`."""
     values = prior_values(images, observations, tracks, weighed.rows)
     assert values is not None
     first_scale, first_shift = (
@@ -146,9 +124,7 @@ def joint_problem(
         SHIFT_SIGMA if values.free_shift else KNOWN_SHIFT_SIGMA,
     )  # fmt: skip
     state = replace(state, scale=first_scale, shift=first_shift, field=np.zeros(len(information)))
-    joint = BundleAdjustment(
-        state, observations, options, ErrorModel(sigma, track_errors), prior=prior, free=Free(held=fixed)
-    )
+    joint = BundleAdjustment(state, observations, options, errors, prior=prior, free=free)
     none = np.zeros(0)
     return joint, PriorPart(weighed.weight, values.rows, prior, none, none, none)
 

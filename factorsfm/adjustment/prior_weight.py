@@ -59,12 +59,6 @@ def sample_points(count: int, seed: int = 0) -> Index:
     return np.sort(rng.permutation(count)[:_SAMPLE])
 
 
-def usual_weight(angles: Array) -> PriorWeight:
-    """What networks are like at worst usually, for points in some directions (n, 2)."""
-    length = float(np.sqrt(np.prod(_LENGTHS)) * np.ptp(angles, axis=0).max())
-    return PriorWeight(_USUAL_FACTOR * _USUAL_SMOOTH, _USUAL_FACTOR * _USUAL_LOCAL, max(length, 1e-6), 1.0)
-
-
 def measure_weight(angles: Array, inverse_depth: Array, prior: Array, covariance: Array) -> PriorWeight:
     """Most probable error model given the points of a shot.
 

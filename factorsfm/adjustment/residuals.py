@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
@@ -33,11 +34,12 @@ def by_pose(by_q: Array, q: Array, w: Array) -> Array:
     return np.stack([*turn, -w * gx, -w * gy, -w * gz], -1)
 
 
-def reprojection(q: Array, observed: Array, focal: Array | float) -> tuple[Array, Array]:
-    """``f q_xy / q_z - observed``, the paper's E_PR with undistorted observations.
+def reprojection(q: Array, observed: Array, focal: Array | float, lens: Array | None = None) -> tuple[Array, Array]:
+    """``f distort(q_xy / q_z) - observed``, the paper's E_PR.
 
     Args:
         q: (n, 3); observed: (n, 2) pixels relative to the principal point; focal: pixels, one or (n,).
+        lens: as in `distort`; None: nothing is distorted.
 
     Returns:
         Residual (n, 2) in pixels and its derivative by `q` (n, 2, 3).
@@ -48,6 +50,9 @@ def reprojection(q: Array, observed: Array, focal: Array | float) -> tuple[Array
     by_q = np.zeros((len(q), 2, 3))
     by_q[:, 0, 0] = by_q[:, 1, 1] = gain
     by_q[:, :, 2] = -projected * inverse[:, None]
+    if lens is not None:
+        uv, by_uv, _ = distort(q[:, :2] * inverse[:, None], lens)
+        projected, by_q = np.reshape(focal, (-1, 1)) * uv, by_uv @ by_q
     return projected - observed, by_q
 
 
@@ -98,6 +103,15 @@ def distort(uv: Array, lens: Array) -> tuple[Array, Array, Array]:
     by_lens[:, :, 0], by_lens[:, :, 1] = uv * share * square, uv * share * square**2
     by_lens[:, [0, 1], [2, 3]] = 1.0
     return uv * gain + center, by_uv, by_lens
+
+
+def undistort(uv: Array, lens: Array) -> Array:
+    """Inverse of `distort`: (n, 2) undistorted coordinates, NaN where there are none."""
+    k1, k2, x, y = lens[:4].tolist()
+    if not any((k1, k2, x, y)):
+        return uv
+    camera = pycolmap.Camera(model="RADIAL", width=1, height=1, params=[1.0, x, y, k1, k2])
+    return np.asarray(camera.cam_from_img(uv), np.float64)
 
 
 def affine_inverse_depth(

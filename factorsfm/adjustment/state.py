@@ -7,7 +7,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.adjustment.residuals import camera_points
+from factorsfm.adjustment.observations import READOUT, Observations
+from factorsfm.adjustment.residuals import camera_points, undistort
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -24,11 +25,11 @@ class State:
         world: the frame whose camera is the world, -1 for none.
         bearing (n, 3) unit, inverse_distance (n,): points seen from the world's origin.
         log_focal: (g,) logarithms of the focal lengths in pixels.
-        lens: (6,) where they are estimated: distortion and principal point as in `factors.distort`, and the readout as
-            in `rolling_shutter`.
+        lens: (6,) distortion and principal point as in `residuals.distort`, and the readout of a rolling shutter along
+            columns and rows, see `Sweep`; zero where the observations are undistorted already.
         group: (k,) which of the focal lengths is that of each frame; by default all have the first.
         scale, shift: (images,) affine of each image with a prior.
-        control: datum and marked points, see `control_term`; empty without control.
+        control: world alignment and marked points, see `control.residuals`; empty without control.
         field: (nodes,) smooth error of the prior in units of inverse depth, shared by all its images.
     """
 
@@ -81,7 +82,13 @@ class State:
         )
 
     def camera_points(self, frame: Index, point: Index) -> Array:
-        """(m, 3) homogeneous camera-frame vectors `q` of `factors.camera_points`."""
+        """(m, 3) homogeneous camera-frame vectors `q` of `residuals.camera_points`."""
         return camera_points(
             self.rotation[frame], self.translation[frame], self.bearing[point], self.inverse_distance[point]
         )
+
+    def normalized(self, observations: Observations) -> Array:
+        """(m, 2) undistorted normalised coordinates of what the lens shows; NaN where it has no ray for a pixel."""
+        o = observations
+        distorted = (o.pixels - o.swept(self.lens[READOUT])) / self.focal[o.frame, None]
+        return undistort(distorted, self.lens)

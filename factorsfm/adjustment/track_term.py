@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from factorsfm.adjustment.columns import Columns
 from factorsfm.adjustment.elimination import Term
 from factorsfm.adjustment.marginals import tangent_basis
-from factorsfm.adjustment.observations import READOUT, Observations
+from factorsfm.adjustment.observations import DISTORTION, READOUT, Observations
 from factorsfm.adjustment.problem import ErrorModel
 from factorsfm.adjustment.residuals import by_pose, cauchy, distort, reprojection
 from factorsfm.adjustment.state import State
@@ -22,35 +22,26 @@ class TrackTerm:
     """Reprojection residuals, in standard deviations; points behind a camera keep a large one, and no derivative.
 
     Args:
-        state: with the focal lengths and the lens through which the observations were normalised.
         kernel: scale of the Cauchy kernel, where the errors are independent.
-        bends: whether the lens of the state distorts and sweeps; otherwise it is zero.
-        optics: whether focal lengths or lens are variables.
+        focal, lens: whether focal lengths and lens are variables.
     """
 
     def __init__(
-        self, state: State, observations: Observations, errors: ErrorModel, kernel: float, *, bends: bool, optics: bool
+        self, state: State, observations: Observations, errors: ErrorModel, kernel: float, *, focal: bool, lens: bool
     ) -> None:
         self._observations, self._errors, self._kernel = observations, errors, kernel
         self._columns = Columns.of(state)
         self._group = state.group[observations.frame]
-        self._bends, self._optics = bends, optics
-        seen = distort(observations.xy, state.lens)[0] if bends else observations.xy
-        self._pixels = seen * self._focal(state)[:, None]  # what was measured, whatever the lens
-        if bends:
-            self._pixels += observations.swept(state.lens[READOUT])
+        self._optics, self._lens = focal or lens, lens
 
     def residual(self, state: State) -> tuple[Array, Array, Array]:
         """(m, 2) residuals, their derivative (m, 2, 3) by the points in the cameras, and these (m, 3)."""
-        o, focal = self._observations, self._focal(state)
+        o = self._observations
         q = state.camera_points(o.frame, o.point)
         behind = q[:, 2] <= _NEAREST
         q[behind, 2] = _NEAREST
-        residual, by_q = reprojection(q, self._pixels, focal)
-        if self._bends:
-            uv, by_uv, _ = distort(q[:, :2] / q[:, 2:], state.lens)
-            residual = focal[:, None] * uv - self._pixels + o.swept(state.lens[READOUT])
-            by_q = by_uv @ by_q
+        lens = state.lens if self._lens or state.lens[DISTORTION].any() else None
+        residual, by_q = reprojection(q, self._observed(state), self._focal(state), lens)
         by_q[behind] = 0.0
         return residual / self._errors.sigma, by_q / self._errors.sigma, q
 
@@ -93,14 +84,17 @@ class TrackTerm:
         focal = np.exp(state.log_focal)
         return np.asarray(focal if len(focal) == 1 else focal[self._group])
 
+    def _observed(self, state: State) -> Array:
+        """(m, 2) where each point would be seen if the whole image were read at once, pixels."""
+        return self._observations.pixels - self._observations.swept(state.lens[READOUT])
+
     def _by_optics(self, state: State, residual: Array, q: Array) -> tuple[Array, NDArray[np.int64]]:
         """(m, 2, c) derivative of the residuals by focal length and lens of each observation, and (m, c) columns."""
         o, sigma = self._observations, self._errors.sigma
-        measured = self._pixels - o.swept(state.lens[READOUT])
         front = (q[:, 2] > _NEAREST)[:, None, None]
-        by_focal = front * (residual + measured / sigma)[:, :, None]  # d r / d log f is the prediction
+        by_focal = front * (residual + self._observed(state) / sigma)[:, :, None]  # d r / d log f is the prediction
         focal_columns = self._columns.log_focal.start + self._group[:, None]
-        if not self._bends:
+        if not self._lens:
             return by_focal, focal_columns
         by_lens = distort(q[:, :2] / q[:, 2:], state.lens)[2]
         by_lens *= front * (self._focal(state) / sigma)[:, None, None]

@@ -32,6 +32,20 @@ def pixels_from_normalized(camera: pycolmap.Camera, uv: NDArray[np.float64]) -> 
     return np.asarray(camera.img_from_cam(rays), dtype=np.float64) - PIXEL_CENTER
 
 
+def without_distortion(camera: pycolmap.Camera) -> pycolmap.Camera:
+    """A pinhole with the same focal lengths and principal point."""
+    return pycolmap.Camera(
+        camera_id=camera.camera_id,
+        model="PINHOLE",
+        width=camera.width,
+        height=camera.height,
+        params=[
+            camera.focal_length_x, camera.focal_length_y, camera.principal_point_x, camera.principal_point_y,
+        ],
+        has_prior_focal_length=camera.has_prior_focal_length,
+    )  # fmt: skip
+
+
 def with_focal(camera: pycolmap.Camera, focal: float) -> pycolmap.Camera:
     """The same camera with another mean focal length (pixels)."""
     scaled = pycolmap.Camera(camera.todict())

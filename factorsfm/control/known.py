@@ -1,4 +1,4 @@
-"""Control: what is known of a scene beforehand, in a world of its own: poses, points, distances, heights.
+"""Control: poses, points, distances and heights of a scene that are known, in a world of their own.
 
 Positions and lengths are in the unit of that world, which the result takes over and calls metres. Every value comes
 with its standard deviation (`sigma`). Frames are named by their name, with or without suffix, or by their index.
@@ -6,6 +6,7 @@ with its standard deviation (`sigma`). Frames are named by their name, with or w
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path, PurePath
@@ -15,10 +16,10 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.adjustment.observations import Observations
 from factorsfm.control.world_alignment import check_enough
 from factorsfm.support.errors import InputError
 from factorsfm.support.json_reading import read_json
+from factorsfm.tracks.image_tracks import ImageTracks
 
 Array = NDArray[np.float64]
 Vector = Sequence[float] | Array
@@ -230,13 +231,14 @@ class LocatedControl:
     Attributes:
         position: of each frame among those of the source.
         names: of the frames, by position.
-        marks: of the points (rows of `Control.points`) in the frames (positions).
+        marks: by frame: the marked points as tracks whose ids are rows of `Control.points`, in pixels of the frame's
+            camera.
     """
 
     control: Control
     position: dict[FrameKey, int]
     names: list[str]
-    marks: Observations
+    marks: list[ImageTracks]
 
 
 def find_frames(control: Control, frames: Sequence[tuple[int, str]]) -> dict[FrameKey, int]:
@@ -256,29 +258,34 @@ def find_frames(control: Control, frames: Sequence[tuple[int, str]]) -> dict[Fra
     return {key: by_name[key] for key in control.frames}
 
 
-def locate(control: Control, frames: Sequence[NamedFrame], normalized: Callable[[int, Array], Array]) -> LocatedControl:
+def locate(
+    control: Control,
+    frames: Sequence[NamedFrame],
+    in_camera: Callable[[int, Array], tuple[pycolmap.Camera, Array]],
+) -> LocatedControl:
     """Find the frames of the control in a source.
 
     Args:
-        normalized: gives the undistorted normalised coordinates (n, 2) of pixels (n, 2) in the frame at a position.
+        in_camera: gives the camera of the frame at a position, and what pixels (n, 2) of the frame are in it.
 
     Raises:
         InputError: a frame is not there, or a mark is where the lens has no inverse.
     """
     found = find_frames(control, [(frame.index, frame.name) for frame in frames])
-    marks: list[tuple[int, int, Array]] = []
+    marked: dict[int, list[tuple[int, FrameKey, Vector]]] = defaultdict(list)
     for row, point in enumerate(control.points):
         for key, xy in point.pixels.items():
-            uv = normalized(found[key], np.asarray(xy, np.float64)[None])[0]
-            if not np.isfinite(uv).all():
-                raise InputError(f"control: point {point.name} at {list(xy)} in frame {key!r} is outside of the lens")
-            marks.append((found[key], row, uv))
-    seen = Observations(
-        np.array([mark[0] for mark in marks], np.int64),
-        np.array([mark[1] for mark in marks], np.int64),
-        np.array([mark[2] for mark in marks]).reshape(-1, 2),
-    )
-    return LocatedControl(control, found, [frame.name for frame in frames], seen)
+            marked[found[key]].append((row, key, xy))
+    marks = []
+    for position, seen in sorted(marked.items()):
+        camera, pixels = in_camera(position, np.array([xy for _, _, xy in seen], np.float64))
+        tracks = ImageTracks(position, np.array([row for row, _, _ in seen]), pixels, camera)
+        for (row, key, xy), good in zip(seen, tracks.invertible, strict=True):
+            if not good:
+                name = control.points[row].name
+                raise InputError(f"control: point {name} at {list(xy)} in frame {key!r} is outside of the lens")
+        marks.append(tracks)
+    return LocatedControl(control, found, [frame.name for frame in frames], marks)
 
 
 def read_control(path: str | Path) -> Control:

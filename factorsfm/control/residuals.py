@@ -1,10 +1,11 @@
-"""Control as a term of the polish: its residuals with their derivatives, on poses, marked points and the datum.
+"""Control as a term of the polish: its residuals with their derivatives, by poses, marked points and world alignment.
 
-The polish stays in the world of its first camera. The datum takes a position ``x`` of that to the world of the control,
-``y = s R (x - a) + T``. Its seven variables and the positions of the marked points are `State.control` and the last
-columns of the camera side: a rotation vector (applied after the start of R), T, log s, then three for each point.
+The polish stays in the world of its first camera. The world alignment takes a position ``x`` of that to the world of
+the control, ``y = s R (x - a) + T``. Its seven variables and the positions of the marked points are `State.control` and
+the last columns of the camera side: a rotation vector (applied after the start of R), T, log s, then three for each
+point.
 
-Every residual is in standard deviations. Pose derivatives use the convention of `factors`.
+Every residual is in standard deviations. Pose derivatives use the convention of `adjustment.residuals`.
 """
 
 from __future__ import annotations
@@ -18,14 +19,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.adjustment.columns import Columns
+from factorsfm.adjustment.observations import DISTORTION
 from factorsfm.adjustment.residuals import by_pose, camera_points, cauchy, reprojection
 from factorsfm.adjustment.state import State
 from factorsfm.support.rotations import cross_matrices
+from factorsfm.support.similarity import Similarity
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-DATUM = 7  # variables of the datum
+ALIGNMENT = 7  # variables of the world alignment
 
 # Residual (d,), the columns that it depends on (c,), and its derivative by these (d, c).
 Linearized = tuple[Array, Index, Array]
@@ -39,42 +42,47 @@ class Place:
     camera: bool = False
 
 
-class ControlView:
-    """A state as the residuals see it.
+class AlignedState:
+    """A state with its alignment to the world of the control.
 
     Args:
-        start: (3, 3) rotation of the datum before `State.control` turns it; anchor: (3,) the position ``a``.
+        start: (3, 3) rotation of the alignment before `State.control` turns it; anchor: (3,) the position ``a``.
     """
 
     def __init__(self, state: State, start: Array, anchor: Array) -> None:
         self.state, self.columns = state, Columns.of(state)
-        self.first = int(self.columns.control.start)  # column of the first variable of the datum
+        self.first = int(self.columns.control.start)  # column of the first variable of the alignment
         turn, by_vector = cv2.Rodrigues(state.control[:3])
         self.rotation = turn @ start
         self.by_vector = np.asarray(by_vector).reshape(3, 3, 3) @ start  # of the rotation, by the rotation vector
         self.shift, self.scale = state.control[3:6], float(np.exp(state.control[6]))
         self.anchor = anchor
 
+    @property
+    def similarity(self) -> Similarity:
+        """From the world of the polish to that of the control."""
+        return Similarity(self.scale, self.rotation, self.shift - self.scale * self.rotation @ self.anchor)
+
     def place(self, place: Place) -> Linearized:
         """Position in the world of the polish."""
         if place.camera:
             rotation, translation = self.state.rotation[place.row], self.state.translation[place.row]
             return -rotation.T @ translation, self.columns.pose(place.row)[3:], rotation.T
-        offset = DATUM + 3 * place.row
+        offset = ALIGNMENT + 3 * place.row
         return self.state.control[offset : offset + 3], self.first + offset + np.arange(3), np.eye(3)
 
     def known_place(self, place: Place) -> Linearized:
-        """Position in the world of the control, by the place and by the datum."""
+        """Position in the world of the control, by the place and by the alignment."""
         x, columns, by_place = self.place(place)
         away = self.rotation @ (x - self.anchor)
         by_turn = self.scale * (self.by_vector @ (x - self.anchor)).T
-        by_datum = np.concatenate([by_turn, np.eye(3), self.scale * away[:, None]], 1)
-        derivative = np.concatenate([self.scale * self.rotation @ by_place, by_datum], 1)
-        return self.scale * away + self.shift, np.append(columns, self.first + np.arange(DATUM)), derivative
+        by_alignment = np.concatenate([by_turn, np.eye(3), self.scale * away[:, None]], 1)
+        derivative = np.concatenate([self.scale * self.rotation @ by_place, by_alignment], 1)
+        return self.scale * away + self.shift, np.append(columns, self.first + np.arange(ALIGNMENT)), derivative
 
     @property
     def own_turn(self) -> Array:
-        """(3, 3) small rotation of the datum on its right (as of a pose, in `factors`), by its rotation vector."""
+        """(3, 3) small rotation of the alignment on its right, as of a pose, by its rotation vector."""
         skew = self.rotation.T @ self.by_vector
         return np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]])
 
@@ -84,7 +92,7 @@ class ControlView:
 
 
 class Item(Protocol):
-    """Something that is known.
+    """A known value, as a residual.
 
     Attributes:
         name: for people; unit: of its error ("m", "degrees", "px"), `sigma` in the same unit.
@@ -96,7 +104,7 @@ class Item(Protocol):
     def unit(self) -> str: ...
     @property
     def sigma(self) -> float: ...
-    def linearized(self, view: ControlView) -> Linearized: ...
+    def linearized(self, aligned: AlignedState) -> Linearized: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,8 +117,8 @@ class PositionItem:
     sigma: float
     unit: str = "m"
 
-    def linearized(self, view: ControlView) -> Linearized:
-        y, columns, derivative = view.known_place(self.place)
+    def linearized(self, aligned: AlignedState) -> Linearized:
+        y, columns, derivative = aligned.known_place(self.place)
         return (y - self.known) / self.sigma, columns, derivative / self.sigma
 
 
@@ -124,37 +132,37 @@ class RotationItem:
     sigma: float  # degrees
     unit: str = "degrees"
 
-    def linearized(self, view: ControlView) -> Linearized:
-        world_from_cam = view.state.rotation[self.row].T
-        off = self.known @ view.rotation @ world_from_cam
+    def linearized(self, aligned: AlignedState) -> Linearized:
+        world_from_cam = aligned.state.rotation[self.row].T
+        off = self.known @ aligned.rotation @ world_from_cam
         vector = cv2.Rodrigues(off)[0][:, 0]
-        by_camera = np.concatenate([np.eye(3), view.state.rotation[self.row] @ view.own_turn], 1)
+        by_camera = np.concatenate([np.eye(3), aligned.state.rotation[self.row] @ aligned.own_turn], 1)
         derivative = _inverse_right_jacobian(vector) @ by_camera
-        columns = np.append(view.columns.pose(self.row)[:3], view.first + np.arange(3))
+        columns = np.append(aligned.columns.pose(self.row)[:3], aligned.first + np.arange(3))
         sigma = np.radians(self.sigma)
         return vector / sigma, columns, derivative / sigma
 
 
 @dataclass(frozen=True, slots=True)
 class MarkItem:
-    """``(f q_xy / q_z - observed) / sigma`` of a marked point in a frame."""
+    """The residual `reprojection` of a marked point in a frame, over sigma."""
 
     name: str
     row: int
     point: Place
-    observed: Array  # (2,) normalised
+    observed: Array  # (2,) pixels, as in `Observations`
     sigma: float  # pixels
     unit: str = "px"
 
-    def linearized(self, view: ControlView) -> Linearized:
-        s, focal, one = view.state, float(view.state.focal[self.row]), np.ones(1)
-        x, columns, _ = view.place(self.point)
+    def linearized(self, aligned: AlignedState) -> Linearized:
+        s, focal, one = aligned.state, float(aligned.state.focal[self.row]), np.ones(1)
+        x, columns, _ = aligned.place(self.point)
         q = camera_points(s.rotation[self.row], s.translation[self.row], x[None], one)
         q[:, 2] = np.maximum(q[:, 2], 1e-6)
-        residual, by_q = reprojection(q, focal * self.observed[None], focal)
+        residual, by_q = reprojection(q, self.observed[None], focal, s.lens if s.lens[DISTORTION].any() else None)
         by_camera = by_pose(by_q[0], q.repeat(2, 0), one.repeat(2))
         derivative = np.concatenate([by_camera, by_q[0] @ s.rotation[self.row]], 1)
-        return residual[0] / self.sigma, np.append(view.columns.pose(self.row), columns), derivative / self.sigma
+        return residual[0] / self.sigma, np.append(aligned.columns.pose(self.row), columns), derivative / self.sigma
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,13 +175,13 @@ class DistanceItem:
     sigma: float
     unit: str = "m"
 
-    def linearized(self, view: ControlView) -> Linearized:
-        (a, a_columns, by_a), (b, b_columns, by_b) = (view.place(end) for end in self.ends)
+    def linearized(self, aligned: AlignedState) -> Linearized:
+        (a, a_columns, by_a), (b, b_columns, by_b) = (aligned.place(end) for end in self.ends)
         length = float(np.linalg.norm(a - b))
-        along = view.scale * (a - b) / max(length, 1e-12)
-        derivative = np.concatenate([along @ by_a, -along @ by_b, [view.scale * length]])[None]
-        columns = np.concatenate([a_columns, b_columns, [view.scale_column]])
-        return np.array([view.scale * length - self.known]) / self.sigma, columns, derivative / self.sigma
+        along = aligned.scale * (a - b) / max(length, 1e-12)
+        derivative = np.concatenate([along @ by_a, -along @ by_b, [aligned.scale * length]])[None]
+        columns = np.concatenate([a_columns, b_columns, [aligned.scale_column]])
+        return np.array([aligned.scale * length - self.known]) / self.sigma, columns, derivative / self.sigma
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,19 +195,19 @@ class HeightItem:
     sigma: float
     unit: str = "m"
 
-    def linearized(self, view: ControlView) -> Linearized:
-        center, columns, by_center = view.place(Place(self.row, camera=True))
-        base, first, second = (view.place(point)[0] for point in self.points)
+    def linearized(self, aligned: AlignedState) -> Linearized:
+        center, columns, by_center = aligned.place(Place(self.row, camera=True))
+        base, first, second = (aligned.place(point)[0] for point in self.points)
         a, b, e = first - base, second - base, center - base
         normal = np.cross(a, b)
         size = max(float(np.linalg.norm(normal)), 1e-12)
         normal = normal / size
         height = float(normal @ e)
-        side = view.scale * (1.0 if height >= 0.0 else -1.0)
+        side = aligned.scale * (1.0 if height >= 0.0 else -1.0)
         beside = (e - height * normal) / size
         by_e, by_a, by_b = side * normal, side * np.cross(b, beside), side * np.cross(beside, a)
         derivative = np.concatenate([by_e @ by_center, -(by_a + by_b + by_e), by_a, by_b, [side * height]])[None]
-        columns = np.concatenate([columns, *(view.place(point)[1] for point in self.points), [view.scale_column]])
+        columns = np.concatenate([columns, *(aligned.place(point)[1] for point in self.points), [aligned.scale_column]])
         return np.array([side * height - self.known]) / self.sigma, columns, derivative / self.sigma
 
 
@@ -207,8 +215,8 @@ class ControlTerm:
     """All control as a term of `BundleAdjustment`, with a Cauchy kernel on every item.
 
     Args:
-        start: (3, 3) rotation of the datum; anchor: (3,) its place in the world of the polish, see `ControlView`.
-        free: (7 + 3 p,) which variables of the datum and of the marked points are estimated.
+        start: (3, 3) rotation of the alignment; anchor: (3,) its place in the world of the polish, see `AlignedState`.
+        free: (7 + 3 p,) which variables of the alignment and of the marked points are estimated.
         kernel: scale of the Cauchy kernel, standard deviations.
     """
 
@@ -224,13 +232,14 @@ class ControlTerm:
         self.free = free
         self._start, self._anchor = start, anchor
 
-    def view(self, state: State) -> ControlView:
-        return ControlView(state, self._start, self._anchor)
+    def aligned(self, state: State) -> AlignedState:
+        """A state with the alignment of this control."""
+        return AlignedState(state, self._start, self._anchor)
 
     def residuals(self, state: State) -> list[Array]:
         """Of every item, in standard deviations."""
-        view = self.view(state)
-        return [item.linearized(view)[0] for item in self.items]
+        aligned = self.aligned(state)
+        return [item.linearized(aligned)[0] for item in self.items]
 
     def cost(self, state: State) -> float:
         """Robust cost."""
@@ -238,9 +247,9 @@ class ControlTerm:
 
     def add(self, state: State, information: Array, gradient: Array) -> None:
         """Add to the normal equations (c, c) and (c,) of the camera side, see `Columns`."""
-        view = self.view(state)
+        aligned = self.aligned(state)
         for item in self.items:
-            residual, columns, derivative = item.linearized(view)
+            residual, columns, derivative = item.linearized(aligned)
             weight = cauchy(residual[None], self.kernel)[1][0]
             information[np.ix_(columns, columns)] += weight * derivative.T @ derivative
             gradient[columns] += weight * derivative.T @ residual

@@ -1,4 +1,4 @@
-"""The datum: the similarity from the world of a free solution to that of its control, in closed form."""
+"""The world alignment: the similarity from the world of a free solution to that of its control, in closed form."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _DISTINCT = 3.0  # standard deviations by which positions must differ, and lie o
 
 @dataclass(frozen=True, slots=True)
 class Correspondences:
-    """What both worlds know.
+    """Positions, rotations and lengths that both worlds know.
 
     Attributes:
         source, target: (n, 3) positions in the world of the solution and in that of the control; sigma: (n,).
@@ -39,14 +39,14 @@ class Correspondences:
     target_length: Array
 
 
-def start_datum(c: Correspondences, placed: bool) -> Similarity:
+def align_worlds(c: Correspondences, placed: bool) -> Similarity:
     """The similarity that most of the control agrees with.
 
     Umeyama (PAMI 1991) with weights and with orientations as further directions, re-weighted from one small subset
-    after another; that with the least sum of residuals counts.
+    after another; the one with the least sum of residuals counts.
 
     Args:
-        placed: whether the control has a world of its own; where only lengths are known, the datum is a scale.
+        placed: whether the control has a world of its own; where only lengths are known, the alignment is a scale.
 
     Raises:
         ReconstructionError: what is known of the registered frames leaves the scale, the rotation or the place open.
@@ -76,17 +76,17 @@ def _refined(c: Correspondences, subset: NDArray[np.int64], length_scale: float 
     weight = np.zeros(len(c.target))
     weight[subset] = 1.0
     turn = np.ones(len(c.target_rotation))
-    cost, datum = np.inf, Similarity(1.0, np.eye(3), np.zeros(3))
+    cost, alignment = np.inf, Similarity(1.0, np.eye(3), np.zeros(3))
     for _ in range(_REWEIGHTINGS):
-        datum = _fit(c, weight, turn, length_scale)
-        off = np.linalg.norm(datum.points(c.source) - c.target, axis=1) / c.sigma
-        turned = np.linalg.norm(datum.rotations(c.source_rotation) - c.target_rotation, axis=(1, 2))
+        alignment = _fit(c, weight, turn, length_scale)
+        off = np.linalg.norm(alignment.points(c.source) - c.target, axis=1) / c.sigma
+        turned = np.linalg.norm(alignment.rotations(c.source_rotation) - c.target_rotation, axis=(1, 2))
         turned = turned / (np.sqrt(2.0) * c.rotation_sigma)
         new_cost = float(np.hypot(off, 1.0).sum() + np.hypot(turned, 1.0).sum())
         if new_cost > 0.999 * cost:
             break
         cost, weight, turn = new_cost, 1.0 / np.hypot(off, 1.0), 1.0 / np.hypot(turned, 1.0)
-    return cost, datum
+    return cost, alignment
 
 
 def _fit(c: Correspondences, weight: Array, turn: Array, length_scale: float | None) -> Similarity:

@@ -12,7 +12,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from factorsfm.camera.guess import first_focal_std, guess_camera
-from factorsfm.camera.projection import PIXEL_CENTER, normalized_from_pixels, with_focal
+from factorsfm.camera.projection import PIXEL_CENTER, with_focal
 from factorsfm.control.known import Control, LocatedControl, locate
 from factorsfm.frames.frame import Frame, bgr_image
 from factorsfm.imagesets.cameras import describe_cameras, find_cameras
@@ -178,17 +178,17 @@ class ImageSet:
         return _resized(self._cameras[0], sizes.most_common(1)[0][0])
 
     def _located_control(self) -> LocatedControl | None:
-        """The control, its marks normalised by the cameras of their images."""
+        """The control, its marks in pixels of the cameras at full size."""
 
-        def normalized(position: int, xy: Array) -> Array:
+        def in_camera(position: int, xy: Array) -> tuple[pycolmap.Camera, Array]:
             photo = self.photos[position]
             if photo.left_out or photo.file.endswith("-turned.png"):
                 raise InputError(f"control: points are marked in {photo.name}, {photo.left_out or photo.remark}")
             own = self._cameras[photo.camera]
             factor = np.array([own.width, own.height]) / photo.full_size
-            return normalized_from_pixels(own, (xy + PIXEL_CENTER) * factor - PIXEL_CENTER)
+            return own, (xy + PIXEL_CENTER) * factor - PIXEL_CENTER
 
-        return None if self.control is None else locate(self.control, self.photos, normalized)
+        return None if self.control is None else locate(self.control, self.photos, in_camera)
 
     # --- steps --------------------------------------------------------------------------------------------------
 
@@ -252,7 +252,7 @@ class ImageSet:
                     options,
                     lambda stage: progress(stage, 0, None),
                     distortion_of(camera) if options.estimates_lens else None,
-                    control=control and _scaled(control, camera.mean_focal_length() / part.focal),
+                    control=control,
                     first_focal=(np.array([part.first_focal]), first_focal_std(camera, given=self._lens_given)),
                 )
             except ReconstructionError as error:
@@ -357,11 +357,6 @@ class ImageSet:
                 status, reason = images[k].status, images[k].message
             frames.append(FrameResult(photo.index, photo.name, photo.timestamp, status, reason))
         return ReconstructionError(message, frames)
-
-
-def _scaled(control: LocatedControl, ratio: float) -> LocatedControl:
-    """What was marked with another focal length; `ratio`: the former one over the new one."""
-    return replace(control, marks=replace(control.marks, xy=control.marks.xy * ratio))
 
 
 def _resized(camera: pycolmap.Camera, size: tuple[int, int]) -> pycolmap.Camera:

@@ -107,7 +107,8 @@ def _put_together(
     added = solved.points[solved.points >= count]
     row_of = np.full(len(points), -1)
     row_of[:count], row_of[added] = np.arange(count), count + np.arange(len(added))
-    xy = pixels_from_normalized(base.camera, solved.adjustment.observations.xy)
+    state = solved.adjustment.state
+    xy = pixels_from_normalized(base.camera, state.normalized(solved.adjustment.observations))
     used = Observed(solved.observed_frame, solved.observed_point, xy)
     fresh = used.only((used.point >= count) | np.isin(used.frame, list(new)))
     result = replace(

@@ -10,7 +10,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
-from factorsfm.adjustment.noise import block_inflation, coordinate_sigma
+from factorsfm.adjustment.noise import coordinate_sigma
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import ErrorModel, Free
 from factorsfm.adjustment.state import State
@@ -158,18 +158,18 @@ def solve(
     positions = np.array(sorted(poses))
     free = Free(held=np.isin(positions, list(held)))
     rotation, translation = (np.array(part) for part in zip(*(poses[p] for p in positions.tolist()), strict=True))
-    log_focal = np.log([camera.mean_focal_length()])
-    uv = normalized_from_pixels(camera, observed.xy)
-    good = np.isfinite(uv).all(axis=1)
+    focal = camera.mean_focal_length()
+    pixels = focal * normalized_from_pixels(camera, observed.xy)
+    good = np.isfinite(pixels).all(axis=1)
     for _ in range(_PASSES):
         seen = np.bincount(observed.point, good, len(places))
         good &= seen[observed.point] >= 2
         order = np.flatnonzero(good)
         order = order[np.lexsort((observed.frame[order], observed.point[order]))]
         points, point = np.unique(observed.point[order], return_inverse=True)
-        observations = Observations(np.searchsorted(positions, observed.frame[order]), point.reshape(-1), uv[order])
+        observations = Observations(np.searchsorted(positions, observed.frame[order]), point.reshape(-1), pixels[order])
         distance = np.linalg.norm(places[points], axis=1)
-        state = State(rotation, translation, places[points] / distance[:, None], 1.0 / distance, log_focal)
+        state = State(rotation, translation, places[points] / distance[:, None], 1.0 / distance, np.log([focal]))
         start = BundleAdjustment(state, observations, _OPTIONS, ErrorModel(1.0), free=free)
         sigma = coordinate_sigma(start.reprojection_errors())
         adjustment = BundleAdjustment(state, observations, _OPTIONS, ErrorModel(sigma), free=free)
@@ -180,6 +180,6 @@ def solve(
         sigma = coordinate_sigma(adjustment.reprojection_errors())
         good[order] = adjustment.reprojection_errors() < _OUTLIER_SIGMAS * sigma
     # Errors that neighbours share count once.
-    sigma *= float(np.sqrt(block_inflation(adjustment.reprojection_vectors(), observations)))
+    sigma *= float(np.sqrt(adjustment.error_inflation()))
     final = BundleAdjustment(adjustment.state, observations, _OPTIONS, ErrorModel(sigma), free=free)
     return Solved(final, positions, np.asarray(points))

@@ -305,7 +305,7 @@ class SetMapper(IncrementalMapper):
         kept = ids < len(length)
         kept[kept] = length[ids[kept]] >= 2
         ids, points = ids[kept], points[kept]
-        observations = gather([image.tracks for image in self._order], ids)
+        observations = gather([image.tracks for image in self._order], ids, self.focal)
         state = state_of(self._order, points, self.focal)
         errors = BundleAdjustment(state, observations, self._adjustment, ErrorModel(1.0)).reprojection_errors()
         sigma = max(float(np.median(errors)), self.options.pixel_sigma)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
-from factorsfm.adjustment.noise import block_inflation, image_cells
+from factorsfm.adjustment.noise import image_cells
 from factorsfm.adjustment.observations import DISTORTION
 from factorsfm.adjustment.semidefinite import squared_deviations
 from factorsfm.adjustment.state import LENS_SIZE
@@ -45,10 +45,11 @@ def lens_covariances(adjustment: BundleAdjustment) -> list[Array]:
     """
     columns = adjustment.columns.optics.start + adjustment.free_optics
     whole = adjustment.marginals().camera
-    inflation = block_inflation(adjustment.reprojection_vectors(), adjustment.observations)
+    inflation = adjustment.error_inflation()
     o, influence = adjustment.observations, adjustment.influences(columns)
-    xy = np.stack([np.bincount(o.point, o.xy[:, i]) for i in range(2)], -1) / np.bincount(o.point)[:, None]
-    parts = image_cells(xy, *_CELLS), np.arange(len(xy))
+    xy = adjustment.state.normalized(o)
+    mean = np.stack([np.bincount(o.point, xy[:, i]) for i in range(2)], -1) / np.bincount(o.point)[:, None]
+    parts = image_cells(mean, *_CELLS), np.arange(len(mean))
     return [whole[np.ix_(columns, columns)] * inflation, *(_pulled_covariance(influence, part) for part in parts)]
 
 
@@ -68,7 +69,7 @@ def _left_out_covariance(adjustment: BundleAdjustment) -> Array:
     o = adjustment.observations
     across, down, stretches = _LEFT_OUT
     time = o.frame * stretches // (int(o.frame.max()) + 1)
-    part = time * across * down + image_cells(o.xy, across, down)
+    part = time * across * down + image_cells(adjustment.state.normalized(o), across, down)
     steps = np.array([adjustment.of(part != left_out).lens_step() for left_out in np.unique(part)])
     steps -= steps.mean(0)
     return np.asarray(steps.T @ steps * ((len(steps) - 1) / len(steps)))

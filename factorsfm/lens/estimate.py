@@ -1,4 +1,4 @@
-"""An unknown lens: focal length, distortion and principal point solved with the cameras, and what of it counts."""
+"""An unknown lens: focal length, distortion, principal point, and whether to believe what is found of them."""
 
 from __future__ import annotations
 
@@ -9,17 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
-from factorsfm.adjustment.noise import coordinate_sigma
-from factorsfm.adjustment.observations import DISTORTION, READOUT, Observations
-from factorsfm.adjustment.problem import ErrorModel, FocalPrior, Free, Known, LensPrior
+from factorsfm.adjustment.observations import DISTORTION, READOUT
+from factorsfm.adjustment.problem import ErrorModel, FocalPrior
 from factorsfm.adjustment.residuals import distort
 from factorsfm.adjustment.state import LENS_SIZE, State
 from factorsfm.lens.certainty import lens_deviations
-from factorsfm.lens.lens import READOUT_SIGMA, Lens, LensEstimate, renormalized, shape_sigmas, through
+from factorsfm.lens.lens import READOUT_SIGMA, Lens, LensEstimate, shape_sigmas, through
 from factorsfm.lens.search import search_lens
-from factorsfm.motion.shot_kind import LEAST_GAIN, classify_motion, translation_gain
-from factorsfm.support.options import DETERMINED_FOCAL_STD, GIVEN_FOCAL_STD, Options, PolishOptions
-from factorsfm.support.status import ShotKind
+from factorsfm.lens.solver import LensSolver, NotInvertibleError
+from factorsfm.support.options import DETERMINED_FOCAL_STD, GIVEN_FOCAL_STD, LensFreedom, Options, PolishOptions
 
 Array = NDArray[np.float64]
 
@@ -35,10 +33,6 @@ _MISFIT = 1.5  # of the standard deviation above which a solution is doubted
 # without a mask above all, which look like a displacement of 1 to 4 thousandths of the width at the outermost tracks.
 _LEAST_EVIDENCE = 9.0  # squared standard deviations
 _JOINT_DISPLACEMENT = 0.00125  # of the width: standard deviation
-
-
-class _NotInvertible(Exception):
-    """Some pixels are seen by no ray of this lens."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,88 +53,104 @@ class _Solution:
 
     @property
     def lens(self) -> Lens:
-        state = self.adjustment.state
-        return Lens(np.exp(state.log_focal), state.lens)
+        return Lens.of(self.adjustment.state)
+
+    @property
+    def groups(self) -> int:
+        """Number of focal lengths."""
+        return len(self.adjustment.state.log_focal)
+
+    @property
+    def deviations(self) -> tuple[Array, Array]:
+        """(g,) and (6,) standard deviations of log focal lengths and shape: the larger ones of both."""
+        focal, shape = np.split(np.fmax(self.std, self.left_out), [self.groups])
+        return focal, shape
 
 
 def estimate_lens(
     adjustment: BundleAdjustment,
-    guess: Lens,
     options: Options,
     focal_prior: FocalPrior | None = None,
     first_focal: tuple[Array, float] | None = None,
 ) -> tuple[BundleAdjustment, LensEstimate]:
-    """The lens where the shot determines it, else what was thought first; and the cameras with it.
+    """The lens where the shot determines it, else the first guess; and the cameras solved with it.
 
     Args:
-        adjustment: converged with the guess; focal_prior: what is known of the focal lengths.
-        first_focal: (g,) what was thought of the focal lengths first, pixels, and the relative standard deviation of
-            that; None: those of the guess, which are kept where the shot determines none.
-
-    Returns:
-        The adjustment with undistorted observations, whose `observations` are those of the lens.
+        adjustment: converged with the guess; focal_prior: of the focal lengths, None for none.
+        first_focal: (g,) focal lengths as they were known first, pixels, and their relative standard deviation; None:
+            those of the guess, which are kept where the shot determines none.
     """
-    o = replace(options.polish, tolerance=_TOLERANCE)
-    groups, width = len(guess.focal), float(np.ptp(adjustment.observations.xy, axis=0).max())
+    guess, width = Lens.of(adjustment.state), _width(adjustment)
+    straight_sigmas, sigmas = _prior_sigmas(guess, options.lens, width)
     held = not options.refine_focal_length
-    shutter = np.where(guess.shape[READOUT] != 0.0, READOUT_SIGMA, 0.0)
-    straight_sigmas = np.r_[np.zeros(4), shutter]
-    sigmas = np.r_[shape_sigmas(options.lens, width), shutter]
-    bends = bool(sigmas[DISTORTION].any())
-    group = adjustment.state.group
-
-    def seen_through(lens: Lens) -> tuple[State, Observations]:
-        state = replace(through(adjustment.state, lens.focal), lens=lens.shape)
-        return state, renormalized(adjustment.observations, guess, lens, group)
-
-    first, bent = guess, None
     if held:
-        focal_prior = FocalPrior(np.log(guess.focal), np.eye(groups) / _HELD_STD**2)
-    else:
-        first, cost = search_lens(adjustment, guess, o)
-        if bends:
-            bent, bent_cost = search_lens(adjustment, guess, o, sigmas)
-            if not bent_cost < _CLEARLY * cost:
-                bent = None
-    start, observations = seen_through(first)
-    straight, moves = _solved_as_it_moves(start, observations, o, adjustment.sigma, straight_sigmas, focal_prior)
-    std, left_out, _ = lens_deviations(straight)
-    best = _Solution(straight, moves, std, left_out, _largest(std, left_out, groups) < DETERMINED_FOCAL_STD)
-    # Strong distortion moves the valley of the focal length: a start without any does not lead there.
-    starts = [(*seen_through(bent), adjustment.sigma, True)] if bent is not None else []
-    starts += [(straight.state, straight.observations, straight.sigma, moves)] if bends else []
-    free = _with_free_shape(starts, o, sigmas, focal_prior)
-    if free is not None:
-        best = _judged_shape(best, free, guess, width)
+        focal_prior = FocalPrior(np.log(guess.focal), np.eye(len(guess.focal)) / _HELD_STD**2)
+    o = replace(options.polish, tolerance=_TOLERANCE)
+    first, bent = (guess, None) if held else _searched(adjustment, o, sigmas)
+    solver = LensSolver(adjustment.observations, o, focal_prior)
+    start = _seen_through(adjustment.state, first)
+    best = straight = _straight_solution(solver, start, adjustment.sigma, straight_sigmas)
+    if sigmas[DISTORTION].any():
+        # Strong distortion moves the valley of the focal length: a start without any does not lead there.
+        starts = [] if bent is None else [(_seen_through(adjustment.state, bent), adjustment.sigma, True)]
+        starts.append((straight.adjustment.state, straight.adjustment.sigma, straight.moves))
+        free = _with_free_shape(solver, starts, sigmas)
+        if free is not None:
+            best = _judged_shape(straight, free, guess, width)
+    estimate = _concluded(best, guess, first_focal or (guess.focal, 0.0), options, held=held)
+    return _settled(adjustment, best, estimate, start, options), estimate
 
-    lens = best.lens
-    focal_std, shape_std = np.split(np.fmax(best.std, best.left_out), [groups])
-    focal_std = np.zeros(groups) if held else focal_std
-    logger.info("focal length %s pixels within %s %%, guess %s", lens.focal, 100 * focal_std, guess.focal)
-    misfit = best.adjustment.sigma if best.adjustment.sigma > _MISFIT * o.doubtful_px else 0.0
-    sound = not misfit and np.abs(np.log(lens.focal / guess.focal)).max() <= np.log(_LARGEST_RATIO)
-    known, rough, final = best.known and bool(sound), False, lens
-    if not known:
-        # In a long valley a standard deviation says little.
-        counts = sound and float(best.std[:groups].max()) < GIVEN_FOCAL_STD
-        focal, rough = _kept_focal(lens.focal, focal_std, first_focal or (guess.focal, 0.0), counts=counts)
-        final = Lens(focal, lens.shape if rough else guess.shape)
-    state, observations, before = adjustment.state, adjustment.observations, guess
-    if known or rough:
-        state = best.adjustment.state if best.moves else through(start, lens.focal)
-        observations, before = best.adjustment.observations, lens
-    if final is not before:
-        state, observations = through(state, final.focal), renormalized(observations, before, final, group)
-    settled = BundleAdjustment(
-        replace(state, lens=np.zeros(LENS_SIZE)),
-        observations,
-        options.polish,
-        ErrorModel(best.adjustment.sigma if known or rough else adjustment.sigma),
-    )
-    settled.solve()
-    return settled, LensEstimate(
-        guess, final, focal_std, shape_std if known or rough else np.full(LENS_SIZE, np.nan), misfit, known, rough
-    )  # fmt: skip
+
+# --- stages -----------------------------------------------------------------------------------------------------
+
+
+def _width(adjustment: BundleAdjustment) -> float:
+    """Of what the tracks fill, normalised."""
+    return float(np.ptp(adjustment.state.normalized(adjustment.observations), axis=0).max())
+
+
+def _prior_sigmas(guess: Lens, freedom: LensFreedom, width: float) -> tuple[Array, Array]:
+    """(6,) prior standard deviations of the shape: without distortion, and with what the options leave free."""
+    readout = np.where(guess.shape[READOUT] != 0.0, READOUT_SIGMA, 0.0)
+    return np.r_[np.zeros(4), readout], np.r_[shape_sigmas(freedom, width), readout]
+
+
+def _searched(adjustment: BundleAdjustment, options: PolishOptions, sigmas: Array) -> tuple[Lens, Lens | None]:
+    """Where the estimate starts: a lens without free distortion, and one with it where it fits clearly better."""
+    first, cost = search_lens(adjustment, options)
+    if not sigmas[DISTORTION].any():
+        return first, None
+    bent, bent_cost = search_lens(adjustment, options, sigmas)
+    return first, bent if bent_cost < _CLEARLY * cost else None
+
+
+def _seen_through(state: State, lens: Lens) -> State:
+    """The state with another lens."""
+    return replace(through(state, lens.focal), lens=lens.shape)
+
+
+def _straight_solution(solver: LensSolver, start: State, sigma: float, sigmas: Array) -> _Solution:
+    """The solution without free distortion."""
+    adjustment, moves = solver.solved_as_it_moves(start, sigma, sigmas)
+    std, left_out, _ = lens_deviations(adjustment)
+    known = _largest(std, left_out, len(start.log_focal)) < DETERMINED_FOCAL_STD
+    return _Solution(adjustment, moves, std, left_out, known)
+
+
+def _with_free_shape(
+    solver: LensSolver, starts: list[tuple[State, float, bool]], sigmas: Array
+) -> tuple[BundleAdjustment, bool] | None:
+    """Solved with free distortion, and whether the camera moves.
+
+    Args:
+        starts: with their noise and whether they move; the first one that leads to an invertible lens counts.
+    """
+    for state, sigma, moves in starts:
+        try:
+            return solver.solved_as_it_moves(state, sigma, sigmas, moves=moves)
+        except NotInvertibleError:
+            continue
+    return None
 
 
 def _judged_shape(straight: _Solution, free: tuple[BundleAdjustment, bool], guess: Lens, width: float) -> _Solution:
@@ -149,7 +159,7 @@ def _judged_shape(straight: _Solution, free: tuple[BundleAdjustment, bool], gues
     Args:
         free: with a free shape, and whether its camera moves; width: of what the tracks fill, normalised.
     """
-    groups = len(guess.focal)
+    groups = straight.groups
     full, moves = free
     std, left_out, evidence = lens_deviations(full, guess.shape)
     displacement = _displacement(full, guess.shape)
@@ -170,6 +180,53 @@ def _judged_shape(straight: _Solution, free: tuple[BundleAdjustment, bool], gues
     return replace(straight, std=std, left_out=left_out, known=known)
 
 
+def _concluded(
+    best: _Solution, guess: Lens, first_focal: tuple[Array, float], options: Options, *, held: bool
+) -> LensEstimate:
+    """The lens that counts: the solution where it is determined and sound, else the guess or a mean of both.
+
+    Args:
+        first_focal: see `estimate_lens`; held: whether the focal lengths are known.
+    """
+    lens, sigma = best.lens, best.adjustment.sigma
+    focal_std, shape_std = best.deviations
+    focal_std = np.zeros(best.groups) if held else focal_std
+    logger.info("focal length %s pixels within %s %%, guess %s", lens.focal, 100 * focal_std, guess.focal)
+    misfit = sigma if sigma > _MISFIT * options.polish.doubtful_px else 0.0
+    sound = not misfit and np.abs(np.log(lens.focal / guess.focal)).max() <= np.log(_LARGEST_RATIO)
+    if best.known and sound:
+        return LensEstimate(lens, focal_std, shape_std, misfit, determined=True)
+    # In a long valley a standard deviation says little.
+    counts = sound and float(best.std[: best.groups].max()) < GIVEN_FOCAL_STD
+    focal, rough = _kept_focal(lens.focal, focal_std, first_focal, counts=bool(counts))
+    if not rough:
+        shape_std = np.full(LENS_SIZE, np.nan)
+    final = Lens(focal, lens.shape if rough else guess.shape)
+    return LensEstimate(final, focal_std, shape_std, misfit, determined=False, rough=rough)
+
+
+def _settled(
+    adjustment: BundleAdjustment, best: _Solution, estimate: LensEstimate, start: State, options: Options
+) -> BundleAdjustment:
+    """The cameras at their best for the lens that counts, which is held.
+
+    Args:
+        adjustment: converged with the guess; start: of the solution `best`.
+    """
+    state, errors = adjustment.state, adjustment.errors
+    if estimate.determined or estimate.rough:
+        state = best.adjustment.state if best.moves else through(start, best.lens.focal)
+        errors = ErrorModel(best.adjustment.sigma)
+    settled = BundleAdjustment(
+        _seen_through(state, estimate.lens), adjustment.observations, options.polish, errors
+    )  # fmt: skip
+    settled.solve()
+    return settled
+
+
+# --- numbers ----------------------------------------------------------------------------------------------------
+
+
 def _largest(std: Array, left_out: Array, groups: int) -> float:
     """Standard deviation of the focal length that is known worst."""
     return float(np.fmax(std, left_out)[:groups].max())
@@ -179,7 +236,7 @@ def _kept_focal(found: Array, std: Array, first: tuple[Array, float], *, counts:
     """Focal lengths that the shot does not determine, (g,), and whether it has a say in them.
 
     Where it counts, and knows them better than they were known at first, they are the means of the logarithms of both,
-    each weighed by its variance; else those of before.
+    each weighted by its inverse variance; else those of before.
     """
     focal, first_std = first
     if not counts or float(std.max()) >= first_std:
@@ -188,95 +245,9 @@ def _kept_focal(found: Array, std: Array, first: tuple[Array, float], *, counts:
     return np.asarray(found**share * focal ** (1.0 - share)), True
 
 
-def _with_free_shape(
-    starts: list[tuple[State, Observations, float, bool]],
-    options: PolishOptions,
-    sigmas: Array,
-    focal_prior: FocalPrior | None,
-) -> tuple[BundleAdjustment, bool] | None:
-    """As `_solved_as_it_moves`, from the first start (with its noise, and whether it moves) that leads to a lens."""
-    for state, observations, sigma, moves in starts:
-        try:
-            return _solved_as_it_moves(state, observations, options, sigma, sigmas, focal_prior, moves=moves)
-        except _NotInvertible:
-            continue
-    return None
-
-
-def _solved_as_it_moves(
-    state: State,
-    observations: Observations,
-    options: PolishOptions,
-    sigma: float,
-    sigmas: Array,
-    focal_prior: FocalPrior | None,
-    *,
-    moves: bool = True,
-) -> tuple[BundleAdjustment, bool]:
-    """As `solved_with_lens`, and whether the camera moves: a translation that is none would bend with the lens."""
-    best = solved_with_lens(state, observations, options, sigma, sigmas, moves=moves, focal_prior=focal_prior)
-    if not moves:
-        return best, False
-    undistorted = BundleAdjustment(best.state, best.observations, options, ErrorModel(best.sigma))
-    motion = classify_motion(undistorted, best.observations, options)
-    general = motion.kind is ShotKind.GENERAL
-    if general and sigmas.any():  # the lens may have bent with a translation that is none: let it do without
-        rotating = BundleAdjustment(
-            motion.rotation_only, best.observations, options, ErrorModel(best.sigma),
-            free=Free(translation=False, focal=True),
-            known=Known(focal_prior, LensPrior(motion.rotation_only.lens, sigmas)),
-        )  # fmt: skip
-        rotating.solve()
-        general = translation_gain(rotating, undistorted) > LEAST_GAIN
-    if general:
-        return best, True
-    still = solved_with_lens(
-        motion.rotation_only, best.observations, options, best.sigma, sigmas, moves=False, focal_prior=focal_prior
-    )
-    return still, False
-
-
-def solved_with_lens(
-    state: State,
-    observations: Observations,
-    options: PolishOptions,
-    sigma: float,
-    sigmas: Array,
-    *,
-    moves: bool = True,
-    focal_prior: FocalPrior | None = None,
-) -> BundleAdjustment:
-    """Converged over the lens too, first at the noise that is thought, then at that of the residuals.
-
-    Its observations are undistorted by the lens of its state.
-
-    Raises:
-        _NotInvertible: on the way there is a lens that does not see some of the pixels.
-    """
-    bends = bool(state.lens.any() or sigmas.any())
-
-    def problem(state: State, observations: Observations, sigma: float) -> BundleAdjustment:
-        _check_invertible(observations)
-        known = Known(focal_prior, LensPrior(state.lens, sigmas) if bends else None)
-        free = Free(translation=moves, focal=True)
-        return BundleAdjustment(state, observations, options, ErrorModel(sigma), free=free, known=known)
-
-    for _ in range(2):
-        solved = problem(state, observations, sigma)
-        solved.solve()
-        before, after = (Lens(np.exp(s.log_focal), s.lens) for s in (state, solved.state))
-        state, observations = solved.state, renormalized(observations, before, after, state.group)
-        sigma = coordinate_sigma(solved.reprojection_errors())
-    return problem(state, observations, sigma)
-
-
-def _check_invertible(observations: Observations) -> None:
-    if not np.isfinite(observations.xy).all():
-        raise _NotInvertible
-
-
 def _displacement(adjustment: BundleAdjustment, guess: Array) -> float:
     """By how much the shape moves the outermost observations against the guess (pixels)."""
     o, state = adjustment.observations, adjustment.state
-    moved = state.focal[o.frame, None] * (distort(o.xy, state.lens)[0] - distort(o.xy, guess)[0])
+    xy = state.normalized(o)
+    moved = state.focal[o.frame, None] * (distort(xy, state.lens)[0] - distort(xy, guess)[0])
     return float(np.percentile(np.linalg.norm(moved, axis=1), 99))

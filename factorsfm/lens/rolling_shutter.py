@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.observations import DISTORTION, READOUT, Observations, Sweep
 from factorsfm.adjustment.problem import ErrorModel, Free, Known, LensPrior
-from factorsfm.adjustment.residuals import by_pose, cauchy, distort, reprojection
+from factorsfm.adjustment.residuals import by_pose, cauchy, reprojection
 from factorsfm.adjustment.state import State
 from factorsfm.lens.certainty import lens_deviations
-from factorsfm.lens.lens import READOUT_SIGMA, Lens, LensEstimate, renormalized, shape_sigmas
+from factorsfm.lens.lens import READOUT_SIGMA, Lens, LensEstimate, shape_sigmas
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.motion.shot_kind import LEAST_GAIN, Motion, translation_gain
 from factorsfm.support.options import Options
@@ -63,11 +63,10 @@ class Shutter:
     """A rolling shutter that the shot shows.
 
     Attributes:
-        guess: with which the tracks were seen; lens: the same or a better one, with the readout.
+        lens: the guess or a better one, with the readout.
         std: standard deviation of the readout.
     """
 
-    guess: Lens
     lens: Lens
     std: float
 
@@ -79,16 +78,7 @@ class Shutter:
     def known_with(self, estimate: LensEstimate) -> Shutter:
         """The same beside a lens that was estimated with it."""
         std = estimate.shape_std[READOUT][self.readout != 0.0]
-        return Shutter(estimate.guess, estimate.lens, float(np.fmax(std, self.std)[0]))
-
-    def recorded(self, observations: Observations, state: State) -> Observations:
-        """What was seen at the time of its pose, back where the recorded images show it; `state`: with its lenses."""
-        focal, still = np.exp(state.log_focal), np.r_[self.lens.shape[DISTORTION], np.zeros(2)]
-        return renormalized(observations, Lens(focal, self.lens.shape), Lens(focal, still), state.group)
-
-    def renormalize(self, observations: Observations, group: Index) -> Observations:
-        """What was seen in the guess, seen at the time of its pose in the lens; `group` as in `State`."""
-        return renormalized(observations, self.guess, self.lens, group)
+        return Shutter(estimate.lens, float(np.fmax(std, self.std)[0]))
 
 
 def with_sweep(
@@ -96,23 +86,21 @@ def with_sweep(
     tracks: Index,
     images: Sequence[MappedImage],
     frames: Sequence[int],
-    guess: Lens,
-    group: Index,
+    focal: Array,
     recording: Recording,
 ) -> Observations:
     """The observations with `Observations.sweep`, from their tracks in the images before and after.
 
     Args:
         tracks: (n,) id of each point; images: all those of the recording; frames: which of them are those of the
-            observations.
-        guess: with which they are undistorted; group: (k,) which of its focal lengths is that of each frame.
+            observations; focal: (k,) of these, with which the observations were gathered.
     """
     gaps = [1, *np.diff(recording.times).tolist(), 1]
-    motion, acceleration, place = (np.zeros_like(observations.xy) for _ in range(3))
+    motion, acceleration, place = (np.zeros_like(observations.pixels) for _ in range(3))
     for k, position in enumerate(frames):
         rows = np.nonzero(observations.frame == k)[0]
-        ids, focal = tracks[observations.point[rows]], float(guess.focal[group[k]])
-        before, here, after = (_pixels(images, position + step, ids, guess, focal) for step in (-1, 0, 1))
+        ids = tracks[observations.point[rows]]
+        before, here, after = (float(focal[k]) * _seen(images, position + step, ids) for step in (-1, 0, 1))
         velocities = (here - before) / gaps[position], (after - here) / gaps[position + 1]
         place[rows] = here / (recording.width, recording.height)
         motion[rows], acceleration[rows] = _motion(*velocities, gaps[position], gaps[position + 1], place[rows])
@@ -149,18 +137,16 @@ def _smooth(values: Array, place: Array) -> Array:
     return np.asarray(design @ field)
 
 
-def _pixels(images: Sequence[MappedImage], position: int, ids: Index, guess: Lens, focal: float) -> Array:
-    """(n, 2) pixels of tracks, from the principal point; NaN where an image does not see them."""
+def _seen(images: Sequence[MappedImage], position: int, ids: Index) -> Array:
+    """(n, 2) normalised coordinates of tracks; NaN where an image does not see them."""
     known = images[position].tracks.ids if 0 <= position < len(images) else ids[:0]
     if not len(known):
         return np.full((len(ids), 2), np.nan)
     at = np.minimum(np.searchsorted(known, ids), len(known) - 1)
-    xy = images[position].tracks.xy[at]
-    seen = distort(xy, guess.shape)[0] if guess.bends else xy
-    return np.asarray(np.where((known[at] == ids)[:, None], focal * seen, np.nan))
+    return np.where((known[at] == ids)[:, None], images[position].tracks.xy[at], np.nan)
 
 
-def find_shutter(adjustment: BundleAdjustment, motion: Motion, guess: Lens, options: Options) -> Shutter | None:
+def find_shutter(adjustment: BundleAdjustment, motion: Motion, options: Options) -> Shutter | None:
     """The rolling shutter where errors hardly explain what the tracks show of one.
 
     Args:
@@ -169,21 +155,21 @@ def find_shutter(adjustment: BundleAdjustment, motion: Motion, guess: Lens, opti
     if motion.kind is ShotKind.STATIC:
         return None
     if motion.gain < _TURNING_GAIN:  # a camera that turns may seem to move, too, since its images are skewed
-        turning = _solved_with_readout(adjustment, motion.rotation_only, guess, options, moves=False)
+        turning = _solved_with_readout(adjustment, motion.rotation_only, options, moves=False)
         if turning is not None and translation_gain(turning, adjustment) < LEAST_GAIN:
-            return _believed(turning, guess)
+            return _believed(turning, adjustment.state)
     if motion.kind is ShotKind.ROTATION:
         return None
-    moving = _solved_with_readout(adjustment, adjustment.state, guess, options, moves=True)
-    return None if moving is None else _believed(moving, guess)
+    moving = _solved_with_readout(adjustment, adjustment.state, options, moves=True)
+    return None if moving is None else _believed(moving, adjustment.state)
 
 
 def _solved_with_readout(
-    adjustment: BundleAdjustment, start: State, guess: Lens, options: Options, *, moves: bool
+    adjustment: BundleAdjustment, state: State, options: Options, *, moves: bool
 ) -> BundleAdjustment | None:
     """Converged with a readout along rows or columns, None where it is hardly any."""
-    o, state = adjustment.observations, replace(start, lens=guess.shape)
-    shape = shape_sigmas(options.lens, float(np.ptp(o.xy, axis=0).max()))
+    o = adjustment.observations
+    shape = shape_sigmas(options.lens, float(np.ptp(state.normalized(o), axis=0).max()))
 
     def problem(free: NDArray[np.bool_]) -> BundleAdjustment:
         return BundleAdjustment(
@@ -203,31 +189,33 @@ def _solved_with_readout(
     return solved
 
 
-def _believed(solved: BundleAdjustment, guess: Lens) -> Shutter | None:
-    """The shutter of a solution, None where it may be chance."""
-    std, left_out, evidence = lens_deviations(solved, guess.shape, READOUT)
+def _believed(solved: BundleAdjustment, guess: State) -> Shutter | None:
+    """The shutter of a solution beside the lens of the guess, None where it may be chance."""
+    std, left_out, evidence = lens_deviations(solved, guess.lens, READOUT)
     readout = solved.state.lens[READOUT]
     deviation = float(np.nanmax(np.fmax(std, left_out)[-2:]))
     logger.info("readout %s within %.3f frames, %.0f squared deviations", readout, deviation, evidence)
     if evidence < _LEAST_EVIDENCE or np.abs(readout).max() > _LONGEST:
         return None
-    return Shutter(guess, Lens(guess.focal, np.r_[guess.shape[DISTORTION], readout]), deviation)
+    return Shutter(Lens(np.exp(guess.log_focal), np.r_[guess.lens[DISTORTION], readout]), deviation)
 
 
-def seen_at_once(state: State, recorded: Observations, weight: Array, *, moves: bool) -> State:
+def seen_at_once(state: State, observations: Observations, weight: Array, *, moves: bool) -> State:
     """The cameras that show the points most nearly where the recorded images do, as if all were read at once.
 
     Args:
-        state: with the points, which stay; recorded: see `Shutter.recorded`; weight: (m,) of each observation.
+        state: with the points, which stay, and the rolling shutter; weight: (m,) of each observation.
         moves: whether the camera does more than turn.
     """
     free = 6 if moves else 3
-    order = np.argsort(recorded.frame, kind="stable")
-    o, weight = recorded.at(order), weight[order]
+    state = replace(state, lens=np.r_[state.lens[DISTORTION], np.zeros(2)])
+    order = np.argsort(observations.frame, kind="stable")
+    o, weight = observations.at(order), weight[order]
+    xy = state.normalized(o)
     first = np.searchsorted(o.frame, np.arange(len(state.rotation)))
     for _ in range(_FITS):
         q = state.camera_points(o.frame, o.point)
-        residual, by_q = reprojection(q, o.xy, 1.0)
+        residual, by_q = reprojection(q, xy, 1.0)
         by_camera = by_pose(by_q.transpose(1, 0, 2), q, state.inverse_distance[o.point])[:, :, :free]
         jacobian = by_camera.transpose(1, 0, 2)
         gain = np.einsum("m,mdi->mid", weight, jacobian)

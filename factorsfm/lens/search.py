@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import ErrorModel, Known, LensPrior
-from factorsfm.adjustment.state import LENS_SIZE, State
-from factorsfm.lens.lens import Lens, renormalized, through
+from factorsfm.adjustment.state import State
+from factorsfm.lens.lens import Lens, through
 from factorsfm.support.options import PolishOptions
 
 Array = NDArray[np.float64]
@@ -22,39 +22,33 @@ _SHAPE_POWERS = np.array([2.0, 4.0, -1.0, -1.0, 0.0, 0.0])  # of the focal lengt
 
 
 def search_lens(
-    adjustment: BundleAdjustment, guess: Lens, options: PolishOptions, sigmas: Array | None = None
+    adjustment: BundleAdjustment, options: PolishOptions, sigmas: Array | None = None
 ) -> tuple[Lens, float]:
-    """The guess, its focal lengths times the factor with which a few frames fit best, and the cost of these.
+    """The lens of a solution, its focal lengths times the factor with which a few frames fit best, and their cost.
 
     Candidates, then parabolas around the best.
 
     Args:
-        sigmas: (4,) with which the shape is free around the guess; None: it is that of the guess.
+        sigmas: (6,) prior standard deviations of the shape around that of the solution; None: it is constant.
     """
+    guess = Lens.of(adjustment.state)
     state, few = _some_frames(adjustment.state, adjustment.observations)
     options = replace(options, iterations=_SEARCH_ITERATIONS, tolerance=1e-3)
-    shape_sigmas = np.zeros(LENS_SIZE) if sigmas is None and guess.shape.any() else sigmas
-    prior = None if shape_sigmas is None else LensPrior(guess.shape, shape_sigmas)
+    known = Known(lens=None if sigmas is None else LensPrior(guess.shape, sigmas))
 
     def fit(near: State, factor: float) -> tuple[float, State]:
         focal = factor * guess.focal
         ratio = float(focal[0] / np.exp(near.log_focal[0])) if sigmas is not None else 1.0
-        lens = Lens(focal, near.lens * ratio**_SHAPE_POWERS)  # the same pixels are moved as far
-        seen = renormalized(few, guess, lens, state.group)
-        if not np.isfinite(seen.xy).all():  # some pixels are seen by no ray of this lens
+        start = replace(through(near, focal), lens=near.lens * ratio**_SHAPE_POWERS)  # the same pixels move as far
+        if not np.isfinite(start.normalized(few)).all():  # the lens has no ray for some pixels
             return np.inf, near
-        problem = BundleAdjustment(
-            replace(through(near, focal), lens=lens.shape),
-            seen,
-            options,
-            ErrorModel(adjustment.sigma),
-            known=Known(lens=prior),
-        )
+        problem = BundleAdjustment(start, few, options, ErrorModel(adjustment.sigma), known=known)
         problem.solve()
         return problem.cost(), problem.state
 
-    candidates = np.sort(0.5 * float(np.ptp(few.xy, axis=0).max()) / np.tan(_FIELDS_OF_VIEW / 2))
-    fits = {1.0: fit(replace(state, lens=guess.shape), 1.0)}
+    width = float(np.ptp(state.normalized(few), axis=0).max())
+    candidates = np.sort(0.5 * width / np.tan(_FIELDS_OF_VIEW / 2))
+    fits = {1.0: fit(state, 1.0)}
     for side in (candidates[candidates > 1.0], candidates[candidates < 1.0][::-1]):
         near = fits[1.0][1]
         for factor in side.tolist():

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.adjustment.gather import gather
+from factorsfm.adjustment.gather import sightings
 from factorsfm.adjustment.observations import PriorObservations
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.mapping.point_map import PointMap
@@ -90,15 +90,15 @@ class DepthGuidance:
         guided = [k for k, i in enumerate(images) if i.tracks.depth is not None and i.affine is not None]
         if self.options.triangulation_depth == "none" or not guided:
             return None, None
-        observations = gather([images[k].tracks for k in guided], ids)
-        value, sigma = np.empty(len(observations.point)), np.empty(len(observations.point))
+        frame, point, _ = sightings([images[k].tracks for k in guided], ids)
+        value, sigma = np.empty(len(point)), np.empty(len(point))
         affine = np.empty((len(guided), 2))
         for row, k in enumerate(guided):
-            image, mine = images[k], observations.frame == row
+            image, mine = images[k], frame == row
             depth = image.tracks.depth
             assert depth is not None
             assert image.affine is not None
-            at = np.searchsorted(image.tracks.ids, ids[observations.point[mine]])
+            at = np.searchsorted(image.tracks.ids, ids[point[mine]])
             measured = np.where(depth.valid[at], depth.inverse_depth[at], np.nan)
             if self._paper:  # lambda (z - gamma D - beta)^2, to first order in the inverse depth
                 value[mine] = self._inverse_depth(measured, image.affine)
@@ -112,6 +112,6 @@ class DepthGuidance:
             return None, None
         n = int(good.sum())
         return affine, PriorObservations(
-            observations.frame[good], np.array(guided)[observations.frame[good]], observations.point[good],
+            frame[good], np.array(guided)[frame[good]], point[good],
             value[good], sigma[good], np.zeros((n, 4), np.int64), np.zeros((n, 4)), np.eye(1), 1.0, 1.0,
         )  # fmt: skip

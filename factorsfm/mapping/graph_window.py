@@ -77,7 +77,7 @@ def measured_window(
         images: keyframes in order of time; constant: (k,) which of their poses do not change; ids: of the landmarks.
     """
     tracks = [image.tracks for image in images]
-    observations = gather(tracks, ids)
+    observations = gather(tracks, ids, focal)
     window = Window(
         positions=np.array([image.position for image in tracks]),
         constant=constant,
@@ -87,7 +87,7 @@ def measured_window(
         points=points.at(ids),
         frame=observations.frame,
         point=observations.point,
-        pixels=focal * observations.xy,
+        pixels=observations.pixels,
         focal=focal,
         sigma=1.0,
     )

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from factorsfm.adjustment.gather import gather
 from factorsfm.mapping.depth_fallback import DepthGuidance
 from factorsfm.mapping.map_registration import NotOnMap, register_on_map
-from factorsfm.mapping.mapped_images import MappedImage, refocus
+from factorsfm.mapping.mapped_images import MappedImage, refocus, state_of
 from factorsfm.mapping.point_map import PointMap
 from factorsfm.mapping.registration import Registration
 from factorsfm.mapping.starts import Start
@@ -108,10 +108,8 @@ def triangulate_tracks(
     """
     affine, prior = guidance.at_observations(images, ids)
     return triangulate(
-        np.array([image.rotation for image in images]),
-        np.array([image.translation for image in images]),
-        gather([image.tracks for image in images], ids),
-        focal=focal,
+        state_of(images, np.zeros((0, 3)), focal),
+        gather([image.tracks for image in images], ids, focal),
         inlier_px=inlier_px,
         sigma=guidance.options.pixel_sigma,
         fallback=fallback,

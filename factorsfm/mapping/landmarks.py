@@ -103,7 +103,7 @@ def solve_alone(
     if affine is not None:
         state = replace(state, scale=affine[:, 0], shift=affine[:, 1], field=np.zeros(1))
     alone = BundleAdjustment(
-        state, gather([image.tracks for image in moved], ids), _SOLVER,
+        state, gather([image.tracks for image in moved], ids, copy.focal), _SOLVER,
         ErrorModel(copy.options.pixel_sigma), prior=prior, free=Free(cameras=False),
     )  # fmt: skip
     state = alone.solve(_ALONE_ITERATIONS)

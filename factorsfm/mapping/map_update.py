@@ -87,7 +87,7 @@ def _adjustment(window: Window, *, focal: bool = False) -> BundleAdjustment:
     state = State(
         window.rotation, window.translation, window.points / distance[:, None], 1.0 / distance, np.log([window.focal])
     )
-    observations = Observations(window.frame, window.point, window.pixels / window.focal)
+    observations = Observations(window.frame, window.point, window.pixels)
     free = Free(focal=focal, held=~window.solved)
     return BundleAdjustment(state, observations, _SOLVER, ErrorModel(window.sigma), free=free)
 
@@ -95,7 +95,7 @@ def _adjustment(window: Window, *, focal: bool = False) -> BundleAdjustment:
 def _burn_ins(copy: MapCopy, images: list[MappedImage], constant: NDArray[np.bool_], window: Window) -> Index:
     """Tracks that rest in the image and contradict the others, when both go on from a solution with all of them."""
     together = _adjustment(window)
-    rests = resting(together.observations, copy.focal)
+    rests = resting(together.observations)
     if not rests.any():
         return np.zeros(0, np.int64)
     others = np.nonzero(~rests)[0]

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.adjustment.observations import Observations
+from factorsfm.adjustment.state import State
 from factorsfm.mapping.registration import register_image
 from factorsfm.mapping.triangulation import triangulate
 from factorsfm.priors.image_depth import ImageDepth
@@ -131,12 +132,13 @@ def start_essential(
     keep = mask.ravel() > 0
     n = int(keep.sum())
     observations = Observations(
-        np.tile([0, 1], n), np.repeat(np.arange(n), 2), np.stack([a[keep], b[keep]], 1).reshape(-1, 2)
+        np.tile([0, 1], n), np.repeat(np.arange(n), 2), focal * np.stack([a[keep], b[keep]], 1).reshape(-1, 2)
     )
-    points = triangulate(
-        np.stack([np.eye(3), rotation]), np.stack([np.zeros(3), translation.ravel()]), observations,
-        focal=focal, inlier_px=4.0 * sigma, sigma=sigma, fallback=np.full(n, 1e-6),
+    cameras = State(
+        np.stack([np.eye(3), rotation]), np.stack([np.zeros(3), translation.ravel()]),
+        np.zeros((0, 3)), np.zeros(0), np.log([focal]),
     )  # fmt: skip
+    points = triangulate(cameras, observations, inlier_px=4.0 * sigma, sigma=sigma, fallback=np.full(n, 1e-6))
     good = (points.inliers == 2) & (points.inverse_distance > 1e-4)
     angle = float(np.degrees(np.median(points.angle[good]))) if good.any() else 0.0
     if good.sum() < min_tracks or angle < angle_deg:

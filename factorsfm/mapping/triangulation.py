@@ -36,11 +36,9 @@ class Triangulation:
 
 
 def triangulate(
-    rotation: Array,
-    translation: Array,
+    cameras: State,
     observations: Observations,
     *,
-    focal: float,
     inlier_px: float,
     sigma: float,
     fallback: Array,
@@ -51,17 +49,18 @@ def triangulate(
     """DLT in RANSAC, then ``min over P of sum E_PR + lambda E_DC`` with cameras and affines fixed (paper, 3.3).
 
     Args:
-        rotation (k, 3, 3), translation (k, 3): `cam_from_world` of the views.
+        cameras: poses and lens of the views.
         observations: sorted by point; every point has at least one.
         fallback: (n,) inverse distance along the first ray where the views leave it open (small angle).
         affine, prior: (images, 2) scale and shift, and the values they scale; None without a prior.
-        focal, inlier_px, sigma: pixels.
+        inlier_px, sigma: pixels.
     """
-    o = observations
+    o, rotation, translation = observations, cameras.rotation, cameras.translation
     start = o.first
     n = len(start)
     count = np.diff(np.append(start, len(o.point)))
-    rays = np.concatenate([o.xy, np.ones((len(o.xy), 1))], 1)
+    xy = cameras.normalized(o)
+    rays = np.concatenate([xy, np.ones((len(xy), 1))], 1)
     rays = np.einsum("nji,nj->ni", rotation[o.frame], rays)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     first = rays[start]
@@ -73,26 +72,20 @@ def triangulate(
     for trial in range(_TRIALS):
         a = start if trial == 0 else start + rng.integers(0, count)
         b = start + count - 1 if trial == 0 else start + rng.integers(0, count)
-        hypotheses.append(_two_view(rotation, translation, o, a, b))
+        hypotheses.append(_two_view(cameras, o.frame, xy, a, b))
     stacked = np.stack(hypotheses)
-    support = np.stack([_support(rotation, translation, o, h, focal, inlier_px) for h in stacked])
+    support = np.stack([_support(cameras, o, xy, h, inlier_px) for h in stacked])
     inliers = np.stack([np.add.reduceat((s < inlier_px).astype(np.int64), start) for s in support])
     robust = np.stack([np.add.reduceat(np.minimum(s, inlier_px), start) for s in support])
     best = np.argmin(robust, axis=0)
     chosen = stacked[best, np.arange(n)]
     distance = np.linalg.norm(chosen[:, :3], axis=1)
-    state = State(
-        rotation,
-        translation,
-        chosen[:, :3] / distance[:, None],
-        chosen[:, 3] / distance,
-        np.log([focal]),
-    )
+    state = replace(cameras, bearing=chosen[:, :3] / distance[:, None], inverse_distance=chosen[:, 3] / distance)
     if affine is not None:
         state = replace(state, scale=affine[:, 0], shift=affine[:, 1], field=np.zeros(1))
     options = replace(PolishOptions(), iterations=8)
     state = BundleAdjustment(state, o, options, ErrorModel(sigma), prior=prior, free=Free(cameras=False)).solve()
-    error = _support(rotation, translation, o, np.c_[state.bearing, state.inverse_distance], focal, inlier_px)
+    error = _support(cameras, o, xy, _homogeneous(state.bearing, state.inverse_distance), inlier_px)
     inliers = np.add.reduceat((error < inlier_px).astype(np.int64), start)
     return Triangulation(state.bearing, state.inverse_distance, inliers, angle)
 
@@ -101,25 +94,25 @@ def _homogeneous(direction: Array, inverse_distance: Array) -> Array:
     return np.concatenate([direction, inverse_distance[:, None]], 1)
 
 
-def _two_view(
-    rotation: Array, translation: Array, o: Observations, a: NDArray[np.int64], b: NDArray[np.int64]
-) -> Array:
+def _two_view(cameras: State, frame: NDArray[np.int64], xy: Array, a: NDArray[np.int64], b: NDArray[np.int64]) -> Array:
     """(n, 4) homogeneous DLT points of one pair of observations per point, in front of the first camera."""
-    camera = np.concatenate([rotation, translation[:, :, None]], 2)
+    camera = np.concatenate([cameras.rotation, cameras.translation[:, :, None]], 2)
     rows = []
     for side in (a, b):
-        p = camera[o.frame[side]]
-        rows += [o.xy[side, :1] * p[:, 2] - p[:, 0], o.xy[side, 1:] * p[:, 2] - p[:, 1]]
+        p = camera[frame[side]]
+        rows += [xy[side, :1] * p[:, 2] - p[:, 0], xy[side, 1:] * p[:, 2] - p[:, 1]]
     point = np.linalg.svd(np.stack(rows, 1))[2][:, 3]
-    depth = np.einsum("ni,ni->n", camera[o.frame[a], 2], point)
+    depth = np.einsum("ni,ni->n", camera[frame[a], 2], point)
     # A homogeneous point and its negative are the same: choose the one in front, at positive or negative distance.
     return np.where(depth[:, None] < 0.0, -point, point)
 
 
-def _support(rotation: Array, translation: Array, o: Observations, points: Array, focal: float, limit: float) -> Array:
-    """(m,) reprojection errors (pixels) of homogeneous points; beyond infinity or behind the camera counts as miss."""
-    q = camera_points(rotation[o.frame], translation[o.frame], points[o.point, :3], points[o.point, 3])
+def _support(cameras: State, o: Observations, xy: Array, points: Array, limit: float) -> Array:
+    """(m,) reprojection errors (undistorted pixels) of homogeneous points; large beyond infinity or behind a camera."""
+    rotation, translation = cameras.rotation[o.frame], cameras.translation[o.frame]
+    q = camera_points(rotation, translation, points[o.point, :3], points[o.point, 3])
     front = (q[:, 2] > 1e-9) & (points[o.point, 3] > 0.0)
     error = np.full(len(q), 10.0 * limit)
-    error[front] = np.linalg.norm(reprojection(q[front], focal * o.xy[front], focal)[0], axis=1)
+    focal = cameras.focal[o.frame][front]
+    error[front] = np.linalg.norm(reprojection(q[front], focal[:, None] * xy[front], focal)[0], axis=1)
     return error

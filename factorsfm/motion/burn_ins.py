@@ -22,16 +22,12 @@ _LEAST, _LEAST_SHARE = 8, 0.08  # points: fewer do no harm
 _CONTRADICTS = 0.95  # of the cost of the others' observations, if they are explained alone
 
 
-def resting(observations: Observations, focal: float) -> NDArray[np.bool_]:
-    """(n,) which points rest in the image while what else is seen moves; none where they are too few to do harm.
-
-    Args:
-        focal: pixels.
-    """
+def resting(observations: Observations) -> NDArray[np.bool_]:
+    """(n,) which points rest in the image while what else is seen moves; none where they are too few to do harm."""
     o = observations
     start = o.first
     first, last = o.frame[start], o.frame[np.append(start[1:], len(o.frame)) - 1]
-    moved = np.linalg.norm(o.xy - o.xy[start[o.point]], axis=1)
+    moved = np.linalg.norm(o.pixels - o.pixels[start[o.point]], axis=1)
     reach = np.maximum.reduceat(moved, start)
     expected = np.zeros(len(start))
     suspects = np.nonzero(reach < _RESTS * reach.max())[0]
@@ -40,17 +36,17 @@ def resting(observations: Observations, focal: float) -> NDArray[np.bool_]:
     by_frame = np.split(rows, np.searchsorted(o.frame[rows], np.arange(1, last.max() + 1)))
     for frame in np.unique(first[suspects]).tolist() if len(suspects) >= least else ():
         seen = np.full((len(start), 2), np.nan)
-        seen[o.point[by_frame[frame]]] = o.xy[by_frame[frame]]
+        seen[o.point[by_frame[frame]]] = o.pixels[by_frame[frame]]
         born = suspects[first[suspects] == frame]
         end = int(last[born].max())
         for later in sorted({min(frame + 2**k, end) for k in range((end - frame).bit_length() + 1)}):
             there = by_frame[later]
-            shift = np.linalg.norm(o.xy[there] - seen[o.point[there]], axis=1)
+            shift = np.linalg.norm(o.pixels[there] - seen[o.point[there]], axis=1)
             shift = shift[np.isfinite(shift)]
             lasting = born[last[born] >= later]
             if len(shift):
                 expected[lasting] = np.maximum(expected[lasting], np.median(shift))
-    found = (focal * expected > _MOVED_PX) & (reach < _RESTS * expected)
+    found = (expected > _MOVED_PX) & (reach < _RESTS * expected)
     return np.asarray(found & (found.sum() >= least))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.observations import Observations
@@ -12,6 +13,8 @@ from factorsfm.adjustment.problem import ErrorModel, Free
 from factorsfm.adjustment.state import State
 from factorsfm.support.options import PolishOptions
 from factorsfm.support.status import ShotKind
+
+Array = NDArray[np.float64]
 
 _STATIC_SHARE = 0.004  # largest median displacement of the tracks of a static shot, in focal lengths
 # Noise costs one unit per observation (two coordinates, half a unit each). Translation and depths fit some of it; they
@@ -36,24 +39,24 @@ class Motion:
     rotation_only: State
 
 
-def displacement(observations: Observations) -> float:
-    """Largest median displacement of the tracks of a frame against their first observation (normalised)."""
+def displacement(observations: Observations, xy: Array) -> float:
+    """Largest median displacement of the tracks of a frame against their first observation, normalised as `xy`."""
     o = observations
-    moved = np.linalg.norm(o.xy - o.xy[o.first[o.point]], axis=1)
+    moved = np.linalg.norm(xy - xy[o.first[o.point]], axis=1)
     order = np.argsort(o.frame, kind="stable")
     parts = np.split(moved[order], np.nonzero(np.diff(o.frame[order]))[0] + 1)
     return max(float(np.median(part)) for part in parts)
 
 
-def classify_motion(adjustment: BundleAdjustment, observations: Observations, options: PolishOptions) -> Motion:
+def classify_motion(adjustment: BundleAdjustment, options: PolishOptions) -> Motion:
     """Static, pure rotation, or general motion: does translation explain what rotation alone cannot?
 
     Args:
-        adjustment: converged over poses and points of `observations`.
+        adjustment: converged over poses and points.
     """
-    state = adjustment.state
-    start = observations.first
-    rays = np.concatenate([observations.xy[start], np.ones((len(start), 1))], 1)
+    state, observations = adjustment.state, adjustment.observations
+    start, xy = observations.first, state.normalized(observations)
+    rays = np.concatenate([xy[start], np.ones((len(start), 1))], 1)
     rays = np.einsum("nji,nj->ni", state.rotation[observations.frame[start]], rays)
     rotation_only = BundleAdjustment(
         replace(
@@ -68,7 +71,7 @@ def classify_motion(adjustment: BundleAdjustment, observations: Observations, op
     )
     rotation_only.solve()
     gain = translation_gain(rotation_only, adjustment)
-    moved = displacement(observations)
+    moved = displacement(observations, xy)
     kind = ShotKind.ROTATION if moved > _STATIC_SHARE else ShotKind.STATIC
     if gain > LEAST_GAIN:
         kind = ShotKind.GENERAL

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
-from factorsfm.adjustment.noise import FIRST_SIGMA_PX, block_inflation, coordinate_sigma, image_cells
+from factorsfm.adjustment.noise import FIRST_SIGMA_PX, coordinate_sigma, image_cells
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import ErrorModel, Free
 from factorsfm.adjustment.state import State
@@ -27,28 +27,25 @@ _CORE_TRACKS = 400  # tracks with which the cameras converge first
 _CELLS, _CELL_TRACKS = (8, 5), 10  # across and down, and the tracks of each with which an unknown lens is estimated
 
 
-def converge_cameras(start: State, few: Observations, options: Options) -> tuple[Index, BundleAdjustment]:
+def start_cameras(start: State, few: Observations, options: Options) -> tuple[Index, BundleAdjustment]:
     """All cameras on the core tracks: which points are kept, and the solution.
 
     Residuals that are large, or alike among neighbouring tracks and frames, say that the solution is not one: the
     incremental map may have been bent or depth-reversed beyond repair. Other starts are tried then, and the best fit
     is kept. (A single track may well repeat its error for many frames: it slides along what it follows.)
     """
-    kept, best = np.arange(len(start.bearing)), converge(start, few, options)
-    rests = resting(few, float(np.median(start.focal)))
+    kept, best = np.arange(len(start.bearing)), converged(start, few, options)
+    rests = resting(few)
     if rests.any():
         others = np.nonzero(~rests)[0]
-        alone = converge(start.of(others), few.of(others), options)
+        alone = converged(start.of(others), few.of(others), options)
         if contradicts(best, alone, ~rests):
             logger.info("%d of %d points rest in the image and are left out", rests.sum(), len(rests))
             kept, start, few, best = others, start.of(others), alone.observations, alone
-    if (
-        best.sigma > options.polish.doubtful_px
-        or block_inflation(best.reprojection_vectors(), few) > _DOUBTFUL_INFLATION
-    ):
+    if best.sigma > options.polish.doubtful_px or best.error_inflation() > _DOUBTFUL_INFLATION:
         logger.info("the solution does not fit (%.2f px), trying other starts", best.sigma)
-        best = _better(best, converge(_flat(start, few, options.polish), few, options))
-        best = _better(best, converge(_reversed(best.state), few, options))
+        best = _better(best, converged(_flat(start, few, options.polish), few, options))
+        best = _better(best, converged(_reversed(best.state), few, options))
     return kept, best
 
 
@@ -60,7 +57,7 @@ def _better(known: BundleAdjustment, other: BundleAdjustment) -> BundleAdjustmen
     return other if other_cost < _CLEARLY * cost else known
 
 
-def converge(part: State, few: Observations, options: Options) -> BundleAdjustment:
+def converged(part: State, few: Observations, options: Options) -> BundleAdjustment:
     """Converged from one start, first with a wide kernel."""
     o = options.polish
     errors = BundleAdjustment(part, few, o, ErrorModel(1.0)).reprojection_errors()
@@ -132,7 +129,7 @@ def _everywhere(observations: Observations, count: int) -> Index:
     The longest tracks of a pan cross its middle, and say little of its rim.
     """
     o = observations
-    pairs, seen = np.unique(np.stack([image_cells(o.xy, *_CELLS), o.point], 1), axis=0, return_counts=True)
+    pairs, seen = np.unique(np.stack([image_cells(o.pixels, *_CELLS), o.point], 1), axis=0, return_counts=True)
     cell, point = pairs[np.lexsort((-seen, pairs[:, 0]))].T
     place = np.arange(len(cell)) - np.searchsorted(cell, cell)
     return np.unique(point[place < count])

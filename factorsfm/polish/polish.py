@@ -4,37 +4,33 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
-from factorsfm.adjustment.gather import gather
 from factorsfm.adjustment.marginals import in_scene_unit
-from factorsfm.adjustment.noise import SMALLEST_SIGMA_PX, coordinate_sigma
+from factorsfm.adjustment.noise import coordinate_sigma
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.prior_term import PriorPart, joint_problem
 from factorsfm.adjustment.problem import ErrorModel, Free
 from factorsfm.adjustment.residuals import cauchy
 from factorsfm.adjustment.state import State
 from factorsfm.adjustment.track_errors import TrackErrors, measure_track_errors
-from factorsfm.control.fit import ControlFit
 from factorsfm.control.known import LocatedControl
 from factorsfm.control.solve import frames_under_control, solve_under_control
-from factorsfm.lens.lens import Lens, LensEstimate
-from factorsfm.lens.rolling_shutter import Recording, Shutter, seen_at_once, with_sweep
+from factorsfm.lens.rolling_shutter import Recording, seen_at_once
 from factorsfm.mapping.mapped_images import MappedImage
-from factorsfm.mapping.registration import register_image
-from factorsfm.motion.shot_kind import Motion
 from factorsfm.polish.connected_frames import connected_frames
-from factorsfm.polish.observability import CameraObservability, camera_observability, pose_blocks
-from factorsfm.polish.start import polish_start
+from factorsfm.polish.frames_between import add_frames_between, solved_frames, too_few_tracks
+from factorsfm.polish.observability import camera_observability, pose_blocks
+from factorsfm.polish.polished import Polished
+from factorsfm.polish.shot import Shot
+from factorsfm.polish.start import PolishStart, polish_start
 from factorsfm.support.errors import ReconstructionError
 from factorsfm.support.options import Options, PolishOptions
-from factorsfm.support.similarity import Similarity
 from factorsfm.support.status import ShotKind
-from factorsfm.tracks.image_tracks import seen_by
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -42,44 +38,6 @@ Index = NDArray[np.int64]
 logger = logging.getLogger(__name__)
 
 _FIRST_ITERATIONS = 2  # over all tracks, until their errors are measured
-
-
-@dataclass(slots=True)
-class Polished:
-    """Result of the polish; the first of its cameras is the world, the median inverse distance is about 1.
-
-    Attributes:
-        frames: (k,) positions of the images in `state`; tracks: (n,) track of each point.
-        errors: (m,) reprojection errors of `observations` (pixels); sigma: their standard deviation.
-        covariance: (k, 6, 6) of the poses, GTSAM's convention, `in_scene_unit`.
-        observability: what carries each of them.
-        point_std: (n,) standard deviations of the inverse distances, in the same unit.
-        left_out: why, of the registered images that have no pose here.
-        lens: what became of an unknown lens, None where it is known.
-        shutter: a rolling shutter, None where the shot shows none; recorded: whether poses and observations are those
-            of the recorded images all the same, see `Options.shutter`.
-        datum, control: from this world to that of the control, and what the control did; None without control.
-        control_unused: whether there is control that could not take part.
-    """
-
-    frames: list[int]
-    state: State
-    tracks: Index
-    observations: Observations
-    errors: Array
-    sigma: float
-    motion: Motion
-    covariance: Array
-    observability: list[CameraObservability]
-    point_std: Array
-    left_out: dict[int, str]
-    prior: PriorPart | None = None
-    lens: LensEstimate | None = None
-    shutter: Shutter | None = None
-    recorded: bool = False
-    datum: Similarity | None = None
-    control: ControlFit | None = None
-    control_unused: bool = False
 
 
 def polish(
@@ -96,253 +54,151 @@ def polish(
 ) -> Polished:
     """Triangulate all tracks and minimise over all registered frames.
 
-    A frame of which hardly any track is left among those that fit the cameras is held by nothing: all is done again
-    without it.
-
     Args:
         images: at least one registered; map_points: track ids and positions of the incremental map.
         focal: (g,) focal lengths, pixels; first guesses where the options refine them.
-        shape: (4,) distortion of the lens as in `factors.distort` where the options refine the lens; None is none.
+        shape: (4,) distortion of the lens as in `residuals.distort` where the options refine the lens; None: the
+            cameras of the images know their distortion.
         groups: (images,) which of the focal lengths is that of each image; None: all have the first.
-        first_focal: what was thought of the focal lengths first, as in `estimate_lens`; None: `focal`.
+        first_focal: the focal lengths as they were known first, as in `estimate_lens`; None: `focal`.
         recording: of which the images are all, if their rows may have been read one after another; None: all at once,
             or in no order of time.
-        control: what is known beforehand, its marks normalised as the tracks are; it takes part at the end, and only
-            where the camera moves.
+        control: known poses, points and lengths; it takes part at the end, and only where the camera moves.
 
     Raises:
         ReconstructionError: hardly any tracks are left that join frames, or what is known of the registered frames
             leaves open where the world of the control is.
     """
-    o, least = options.polish, options.mapper.min_inliers
-    registered = [i for i, image in enumerate(images) if image.registered]
-    groups = np.zeros(len(images), np.int64) if groups is None else groups
-    guess = Lens(focal) if shape is None else Lens(focal, np.r_[shape, np.zeros(2)])
-    left_out: dict[int, str] = {}
-    while True:
-        frames = _solved_frames(images, registered, o.max_frames)
-        if control is not None:
-            frames = sorted({*frames, *frames_under_control(registered, control, o.max_frames // 2)})
-        used = [images[i] for i in frames]
-        observations, tracks = _gather(used, min(o.min_track_length, max(2, len(used))))
-        unheld = _unheld(observations, frames, least)
-        if not unheld:
-            group = groups[frames]
-            if recording is not None:
-                observations = with_sweep(observations, tracks, images, frames, guess, group, recording)
-            known = polish_start(
-                used, observations, tracks, map_points, guess, group, frames, options, first_focal, progress
-            )
-            unheld = _unheld(known.observations, frames, least)
-        if not unheld:
-            break
-        logger.info("left out of the polish, too few tracks: images %s", sorted(unheld))
-        left_out.update(unheld)
-        registered = [i for i in registered if i not in left_out]
-        if len(registered) < 2:
-            raise ReconstructionError(
-                f"{len(registered)} of {len(images)} frames have enough tracks that agree with those of other frames, "
-                "at least 2 needed"
-            )
-    observations, tracks, sigma, lens = known.observations, known.tracks, known.sigma, known.lens
-    if control is not None and lens is not None:
-        zooms = len(lens.lens.focal) > len(focal)
-        whole, of_image = (
-            (_between(lens, frames, np.arange(len(images))), np.arange(len(images))) if zooms else (lens, groups)
-        )
-        control = replace(control, marks=whole.renormalize(control.marks, of_image))
-    free, state = known.motion.kind is ShotKind.GENERAL, known.state.seen_from(0)
-
+    shot = Shot.of(images, map_points, focal, shape, groups, first_focal, recording)
+    start, frames, left_out = _start(shot, options, control, progress)
     progress("polish: all tracks")
-    prior = None
-    scale, wide, errors = sigma, float(np.sqrt(known.inflation)), None
-    if o.observation_sigmas is None:
-        state, errors = _with_track_errors(state, observations, sigma, free, o)
-        scale = errors.sigma
-    # Pixel errors that repeat themselves, from frame to frame and among neighbours, weigh less; the kernel keeps its
-    # width in pixels. What a track repeats is counted twice so: what neighbours repeat lasts longer than a stretch.
-    final = replace(o, kernel=o.kernel / wide)
-    if known.prior is not None:
-        adjustment, prior = joint_problem(
-            state,
-            observations,
-            tracks,
-            [image.tracks for image in used],
-            known.prior,
-            scale * wide,
-            final,
-            track_errors=errors,
-        )
-    else:
-        adjustment = BundleAdjustment(
-            state, observations, final, ErrorModel(scale * wide, errors), free=Free(translation=free)
-        )
-    adjustment.solve(o.final_iterations)
-    marginals = adjustment.marginals()
-    camera_covariance = in_scene_unit(marginals, adjustment.state)
-    observability = camera_observability(adjustment, marginals, camera_covariance)
-    k = len(frames)
-    if prior is not None:
-        _describe_affines(prior, adjustment, camera_covariance)
-    result = Polished(
-        frames, adjustment.state, tracks, observations, adjustment.reprojection_errors(), sigma,
-        known.motion, pose_blocks(camera_covariance, k), observability,
-        marginals.inverse_distance_std(camera_covariance), left_out, prior, lens, known.shutter,
-    )  # fmt: skip
-    result.control_unused = control is not None and not free
-    if control is not None and free:
+    adjustment, result = _solved(shot, start, frames, left_out, options.polish)
+    if control is not None and start.motion.kind is ShotKind.GENERAL:
         progress("polish: control")
-        _put_under_control(result, adjustment, control)
+        _put_under_control(result, adjustment, control, shot)
+    result.control_unused = control is not None and result.control is None
+    registered = [position for position in shot.registered if position not in left_out]
     if len(frames) < len(registered):
         progress("polish: frames between")
-        group = groups[registered]
-        if lens is not None and len(lens.lens.focal) > len(focal):
-            group, lens = np.arange(len(registered)), _between(lens, frames, np.array(registered))
-            solved = np.searchsorted(registered, frames)
-            result.state, result.lens = replace(result.state, log_focal=np.log(lens.lens.focal), group=solved), lens
-        _add_frames_between(result, images, registered, group, options, recording)
+        add_frames_between(result, shot, registered, options)
     if result.shutter is not None and options.shutter == "auto":
-        _fit_to_recorded_images(result, result.shutter, o)
+        _fit_to_recorded_images(result, options.polish)
     return result
 
 
-def _with_track_errors(
-    state: State, observations: Observations, sigma: float, free: bool, options: PolishOptions
-) -> tuple[State, TrackErrors]:
-    """The tracks without the prior, and how far their errors persist, which shows where the cameras fit them all."""
-    adjustment = BundleAdjustment(state, observations, options, ErrorModel(sigma), free=Free(translation=free))
-    adjustment.solve(_FIRST_ITERATIONS)
-    return adjustment.state, measure_track_errors(adjustment.reprojection_vectors(), observations, options.kernel)
+# --- the frames that are solved ---------------------------------------------------------------------------------
 
 
-def _unheld(observations: Observations, frames: list[int], least: int) -> dict[int, str]:
+def _start(
+    shot: Shot, options: Options, control: LocatedControl | None, progress: Callable[[str], None]
+) -> tuple[PolishStart, list[int], dict[int, str]]:
+    """Where the solution starts, the positions of its frames, and why others are left out.
+
+    A frame of which hardly any track is left among those that fit the cameras is not determined: all is done again
+    without it.
+    """
+    o, least = options.polish, options.mapper.min_inliers
+    left_out: dict[int, str] = {}
+    while True:
+        registered = [position for position in shot.registered if position not in left_out]
+        if left_out and len(registered) < 2:
+            raise ReconstructionError(
+                f"{len(registered)} of {len(shot.images)} frames have enough tracks that agree with those of other "
+                "frames, at least 2 needed"
+            )
+        frames = solved_frames(shot.images, registered, o.max_frames)
+        if control is not None:
+            frames = sorted({*frames, *frames_under_control(registered, control, o.max_frames // 2)})
+        tracks = shot.long_tracks(frames, min(o.min_track_length, max(2, len(frames))))
+        observations = shot.observations(frames, tracks)
+        unconnected = _unconnected(observations, frames, least)
+        if not unconnected:
+            start = polish_start(shot, frames, shot.swept(observations, frames, tracks), tracks, options, progress)
+            unconnected = _unconnected(start.observations, frames, least)
+        if not unconnected:
+            return start, frames, left_out
+        logger.info("left out of the polish, too few tracks: images %s", sorted(unconnected))
+        left_out.update(unconnected)
+
+
+def _unconnected(observations: Observations, frames: list[int], least: int) -> dict[int, str]:
     """The images (of these, in the order of the observations) that too few observations join to the others, and why."""
     joined, seen = connected_frames(observations, len(frames), least)
-    return {frames[row]: _too_few(int(seen[row]), least) for row in np.nonzero(~joined)[0].tolist()}
+    return {frames[row]: too_few_tracks(int(seen[row]), least) for row in np.nonzero(~joined)[0].tolist()}
 
 
-def _too_few(count: int, least: int) -> str:
-    return f"{count} of {least} needed tracks agree with those of the other frames in the polish"
+# --- the solution -----------------------------------------------------------------------------------------------
 
 
-def _put_under_control(result: Polished, adjustment: BundleAdjustment, control: LocatedControl) -> None:
-    """Everything as it is with the control; what carries each camera stays as the images and the prior have it."""
-    found = solve_under_control(adjustment, control, result.frames)
+def _solved(
+    shot: Shot, start: PolishStart, frames: list[int], left_out: dict[int, str], options: PolishOptions
+) -> tuple[BundleAdjustment, Polished]:
+    """The adjustment over all tracks, converged, and the result."""
+    adjustment, prior = _problem(shot, start, frames, options)
+    adjustment.solve(options.final_iterations)
+    marginals = adjustment.marginals()
+    covariance = in_scene_unit(marginals, adjustment.state)
+    result = Polished(
+        frames, adjustment.state, start.tracks, start.observations, adjustment.reprojection_errors(), start.sigma,
+        start.motion, pose_blocks(covariance, len(frames)), camera_observability(adjustment, marginals, covariance),
+        marginals.inverse_distance_std(covariance), left_out, prior, start.lens, start.shutter,
+    )  # fmt: skip
+    result.describe_prior(adjustment, covariance)
+    return adjustment, result
+
+
+def _problem(
+    shot: Shot, start: PolishStart, frames: list[int], options: PolishOptions
+) -> tuple[BundleAdjustment, PriorPart | None]:
+    """All tracks, with the prior where it takes part."""
+    moves, state = start.motion.kind is ShotKind.GENERAL, start.state.seen_from(0)
+    scale, wide, errors = start.sigma, float(np.sqrt(start.inflation)), None
+    if options.observation_sigmas is None:
+        state, errors = _with_track_errors(state, start, moves, options)
+        scale = errors.sigma
+    # Pixel errors that repeat themselves, from frame to frame and among neighbours, weigh less; the kernel keeps its
+    # width in pixels. What a track repeats is counted twice so: what neighbours repeat lasts longer than a stretch.
+    model, options = ErrorModel(scale * wide, errors), replace(options, kernel=options.kernel / wide)
+    if start.prior is None:
+        return BundleAdjustment(state, start.observations, options, model, free=Free(translation=moves)), None
+    return joint_problem(
+        state, start.observations, start.tracks, shot.tracks(frames), start.prior, model, options
+    )  # fmt: skip
+
+
+def _with_track_errors(
+    state: State, start: PolishStart, moves: bool, options: PolishOptions
+) -> tuple[State, TrackErrors]:
+    """The tracks without the prior, and how far their errors persist, which shows where the cameras fit them all."""
+    adjustment = BundleAdjustment(
+        state, start.observations, options, ErrorModel(start.sigma), free=Free(translation=moves)
+    )
+    adjustment.solve(_FIRST_ITERATIONS)
+    return adjustment.state, measure_track_errors(
+        adjustment.reprojection_vectors(), start.observations, options.kernel
+    )  # fmt: skip
+
+
+# --- what follows -----------------------------------------------------------------------------------------------
+
+
+def _put_under_control(result: Polished, adjustment: BundleAdjustment, control: LocatedControl, shot: Shot) -> None:
+    """Everything as it is with the control; the observability stays that of images and prior."""
+    marks = shot.marks(control.marks, result.frames, len(control.control.points))
+    found = solve_under_control(adjustment, control, marks, result.frames)
     result.state, result.errors = found.adjustment.state, found.adjustment.reprojection_errors()
-    result.covariance, result.datum, result.control = found.covariance, found.datum, found.fit
+    result.covariance, result.world_alignment, result.control = found.covariance, found.world_alignment, found.fit
     result.point_std = found.marginals.inverse_distance_std(found.camera_covariance)
-    if result.prior is not None:
-        _describe_affines(result.prior, found.adjustment, found.camera_covariance)
+    result.describe_prior(found.adjustment, found.camera_covariance)
 
 
-def _describe_affines(prior: PriorPart, adjustment: BundleAdjustment, camera_covariance: Array) -> None:
-    """What a solution says of the prior: its residuals, and how certain scale and shift of each image are."""
-    std = np.sqrt(camera_covariance.diagonal())
-    prior.residual = adjustment.prior_residuals()
-    prior.scale_std, prior.shift_std = std[adjustment.columns.scales], std[adjustment.columns.shifts]
-
-
-def _fit_to_recorded_images(result: Polished, shutter: Shutter, options: PolishOptions) -> None:
-    """What agrees with the rolling shutter, seen by cameras without one."""
-    recorded = shutter.recorded(result.observations, result.state)
+def _fit_to_recorded_images(result: Polished, options: PolishOptions) -> None:
+    """Cameras without a rolling shutter that show the points most nearly where the recorded images do."""
     weight = cauchy(result.errors[:, None] / result.sigma, options.kernel)[1]
     moves = result.motion.kind is ShotKind.GENERAL
-    result.state = replace(seen_at_once(result.state, recorded, weight, moves=moves), world=-1).seen_from(0)
-    result.observations, result.recorded = recorded, True
-    result.errors = BundleAdjustment(result.state, recorded, options, ErrorModel(result.sigma)).reprojection_errors()
-    result.sigma = coordinate_sigma(result.errors)
-
-
-def _gather(images: list[MappedImage], min_length: int) -> tuple[Observations, Index]:
-    """Observations of all tracks that are long enough, sorted by track, and the tracks' ids."""
-    tracks = [image.tracks for image in images]
-    ids = seen_by(tracks, min_length)
-    return gather(tracks, ids), ids
-
-
-# --- long shots -------------------------------------------------------------------------------------------------
-
-
-def _solved_frames(images: list[MappedImage], registered: list[int], limit: int) -> list[int]:
-    """The frames that are variables of the polish: all, or in a long shot the keyframes and others between them."""
-    if len(registered) <= limit:
-        return registered
-    keyframes = [i for i in registered if images[i].keyframe]
-    if len(keyframes) > limit:
-        return [keyframes[k] for k in np.linspace(0, len(keyframes) - 1, limit).astype(int)]
-    others = [i for i in registered if not images[i].keyframe]
-    fill = [others[k] for k in np.linspace(0, len(others) - 1, limit - len(keyframes)).astype(int)]
-    return sorted(keyframes + fill)
-
-
-def _between(lens: LensEstimate, frames: list[int], wanted: Index) -> LensEstimate:
-    """Of a zoom that is known at some images, the lens at others."""
-    return replace(
-        lens,
-        guess=Lens(np.repeat(lens.guess.focal[:1], len(wanted)), lens.guess.shape),
-        lens=Lens(np.exp(np.interp(wanted, frames, np.log(lens.lens.focal))), lens.lens.shape),
-        focal_std=np.interp(wanted, frames, lens.focal_std),
-    )
-
-
-def _add_frames_between(
-    result: Polished,
-    images: list[MappedImage],
-    registered: list[int],
-    group: Index,
-    options: Options,
-    recording: Recording | None,
-) -> None:
-    """Register the frames that were left out on the polished points; `group`: of each registered frame."""
-    state, m = result.state, options.mapper
-    seen = gather([images[f].tracks for f in registered], result.tracks)
-    if (change := result.lens or result.shutter) is not None:
-        if result.shutter is not None and recording is not None:
-            seen = with_sweep(seen, result.tracks, images, registered, change.guess, group, recording)
-        seen = change.renormalize(seen, group)
-    by_frame = {f: np.nonzero(seen.frame == k)[0] for k, f in enumerate(registered)}
-    focal = dict(zip(registered, np.exp(state.log_focal)[group].tolist(), strict=True))
-    solved = np.array(result.frames)
-    points = state.points
-    poses = {f: (state.rotation[k], state.translation[k]) for k, f in enumerate(result.frames)}
-    for f in registered:
-        if f in poses:
-            continue
-        mine = by_frame[f]
-        if len(mine) < m.min_inliers:
-            result.left_out[f] = _too_few(len(mine), m.min_inliers)
-            continue
-        near = int(solved[np.argmin(np.abs(solved - f))])
-        found = register_image(
-            points[seen.point[mine]], seen.xy[mine], *poses[near],
-            focal=focal[f], sigma=max(result.sigma, SMALLEST_SIGMA_PX), inlier_px=m.inlier_px,
-        )  # fmt: skip
-        if found.inliers.sum() >= m.min_inliers:
-            poses[f] = found.rotation, found.translation
-        else:
-            result.left_out[f] = (
-                f"{found.inliers.sum()} of {m.min_inliers} needed inliers among {len(mine)} tracks of the polish"
-            )
-    frames = sorted(poses)
-    row = {f: k for k, f in enumerate(frames)}
-    nearest = np.argmin(np.abs(np.array(frames)[:, None] - solved), axis=1)
-    result.state = replace(
-        state,
-        rotation=np.array([poses[f][0] for f in frames]),
-        translation=np.array([poses[f][1] for f in frames]),
-        group=group[np.isin(registered, frames)],
-    )
-    result.covariance = result.covariance[nearest]
-    result.observability = [result.observability[k] for k in nearest]
-    if result.prior is not None:
-        new_row = np.array([row[f] for f in result.frames])
-        p = result.prior
-        p.images = new_row[p.images]
-        p.observations = replace(p.observations, frame=new_row[p.observations.frame])
-    result.frames = frames
-    kept = np.isin(np.array(registered)[seen.frame], frames)
-    rows = np.searchsorted(frames, np.array(registered)[seen.frame[kept]])
-    result.observations = seen.at(kept, frame=rows)
+    state = replace(seen_at_once(result.state, result.observations, weight, moves=moves), world=-1)
+    result.state, result.recorded = state.seen_from(0), True
     result.errors = BundleAdjustment(
-        result.state, result.observations, options.polish, ErrorModel(result.sigma)
+        result.state, result.observations, options, ErrorModel(result.sigma)
     ).reprojection_errors()
+    result.sigma = coordinate_sigma(result.errors)

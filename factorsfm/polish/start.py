@@ -9,19 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
-from factorsfm.adjustment.noise import FIRST_SIGMA_PX, block_inflation
+from factorsfm.adjustment.noise import FIRST_SIGMA_PX
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.prior_term import WeighedPrior, weigh_prior
-from factorsfm.adjustment.problem import ErrorModel, FocalPrior, Free
+from factorsfm.adjustment.problem import FocalPrior, Free
 from factorsfm.adjustment.state import State
 from factorsfm.lens.estimate import estimate_lens
-from factorsfm.lens.lens import Lens, LensEstimate
+from factorsfm.lens.lens import LensEstimate
 from factorsfm.lens.rolling_shutter import Shutter, find_shutter
 from factorsfm.lens.zoom import find_zoom
-from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.mapping.triangulation import Triangulation, triangulate
 from factorsfm.motion.shot_kind import Motion, classify_motion
-from factorsfm.polish.camera_starts import converge, converge_cameras, core_tracks
+from factorsfm.polish.camera_starts import converged, core_tracks, start_cameras
+from factorsfm.polish.shot import Shot
 from factorsfm.support.options import Options, PolishOptions
 from factorsfm.support.status import ShotKind
 
@@ -37,8 +37,8 @@ class PolishStart:
     """Where the last adjustment starts.
 
     Attributes:
-        state: of cameras and tracks; observations, tracks: that belong together, undistorted by the lens.
-        sigma: of the tracks that hold the cameras, pixels; inflation: of its square, since errors repeat themselves.
+        state: of cameras, lens and points; observations, tracks: that belong together.
+        sigma: of the core tracks, pixels; inflation: of its square, since errors repeat themselves.
         prior: with the weight it earns; lens, shutter: see `Polished`.
     """
 
@@ -53,99 +53,94 @@ class PolishStart:
     shutter: Shutter | None
 
 
+@dataclass(frozen=True, slots=True)
+class _Core:
+    """The cameras solved on the core tracks.
+
+    Attributes:
+        points: rows of the core among all points; adjustment: converged over them.
+    """
+
+    points: Index
+    adjustment: BundleAdjustment
+    motion: Motion
+    lens: LensEstimate | None
+    shutter: Shutter | None
+
+
 def polish_start(
-    images: list[MappedImage],
+    shot: Shot,
+    frames: list[int],
     observations: Observations,
     tracks: Index,
-    map_points: tuple[Index, Array],
-    guess: Lens,
-    group: Index,
-    frames: list[int],
     options: Options,
-    first_focal: tuple[Array, float] | None,
     progress: Callable[[str], None],
 ) -> PolishStart:
     """The cameras on the longest tracks, what the shot says of lens, motion and prior, and all tracks that fit it.
 
     Args:
-        images: registered, at the places `frames` of the shot; observations, tracks: theirs.
-        map_points: track ids and positions of the incremental map.
-        guess: of the lens; group: (k,) which of its focal lengths is that of each image.
-        first_focal: see `polish`.
+        frames: positions of the registered images; observations, tracks: theirs.
     """
-    o = options.polish
     progress("polish: cameras")
-    core = core_tracks(observations, len(images), everywhere=options.estimates_lens)
-    few = observations.of(core)
-    start = _first_guess(images, few, tracks[core], map_points, guess.focal, group, _world(observations))
-    kept, adjustment = converge_cameras(start, few, options)
-    core, few, lens, seen = core[kept], adjustment.observations, None, guess
-    motion, shutter = None, None
-    if few.sweep is not None:
-        motion = classify_motion(adjustment, few, o)
-        shutter = find_shutter(adjustment, motion, guess, options)
-    if shutter is not None:
-        seen = shutter.lens
-        adjustment = converge(adjustment.state, shutter.renormalize(few, group), options)
-    if options.estimates_lens:
-        adjustment, lens = _estimate_lens(adjustment, seen, frames, options, first_focal)
-        lens = replace(lens, guess=replace(lens.guess, shape=guess.shape))
-        shutter = shutter and shutter.known_with(lens)
-    if (change := lens or shutter) is not None:
-        few, observations = adjustment.observations, change.renormalize(observations, adjustment.state.group)
-    if motion is None or change is not None:
-        motion = classify_motion(adjustment, few, o)
-    inflation = block_inflation(adjustment.reprojection_vectors(), few)
+    core = _solved_core(shot, frames, observations, tracks, options)
+    solved, motion = core.adjustment, core.motion
+    inflation = solved.error_inflation()
     prior, part = None, motion.rotation_only
     if motion.kind is ShotKind.GENERAL:
-        part = adjustment.state
-        if o.depth:
-            prior = weigh_prior(adjustment, few, tracks[core], [image.tracks for image in images], inflation)
+        part = solved.state
+        if options.polish.depth:
+            prior = weigh_prior(solved, solved.observations, tracks[core.points], shot.tracks(frames), inflation)
 
     progress("polish: points")
-    sigma = adjustment.sigma
-    state = with_all_points(part, adjustment.state, observations, core)
-    state = BundleAdjustment(
-        state, observations, replace(o, iterations=4), ErrorModel(sigma), free=Free(cameras=False)
-    ).solve()
-    if o.observation_sigmas is None:
-        observations, tracks, state = _without_outliers(state, observations, tracks, sigma, o)
-    else:
-        limit = o.observation_sigmas * sigma
-        observations, tracks, state = _without_outlying_observations(state, observations, tracks, limit, o)
-    return PolishStart(state, observations, tracks, sigma, inflation, motion, prior, lens, shutter)
+    fitting = _with_fitting_tracks(part, core, observations, tracks, options.polish)
+    return PolishStart(*fitting, solved.sigma, inflation, motion, prior, core.lens, core.shutter)
 
 
-def _first_guess(
-    images: list[MappedImage],
-    observations: Observations,
-    tracks: Index,
-    map_points: tuple[Index, Array],
-    focal: Array,
-    group: Index,
-    world: int,
-) -> State:
+def _solved_core(shot: Shot, frames: list[int], observations: Observations, tracks: Index, options: Options) -> _Core:
+    """Cameras, lens and shutter on the longest tracks."""
+    o = options.polish
+    core = core_tracks(observations, len(frames), everywhere=options.estimates_lens)
+    few = observations.of(core)
+    kept, adjustment = start_cameras(_first_guess(shot, frames, few, tracks[core], _world(observations)), few, options)
+    few = adjustment.observations
+    motion, lens, shutter = None, None, None
+    if few.sweep is not None:
+        motion = classify_motion(adjustment, o)
+        shutter = find_shutter(adjustment, motion, options)
+    if shutter is not None:
+        adjustment = converged(replace(adjustment.state, lens=shutter.lens.shape), few, options)
+    if options.estimates_lens:
+        adjustment, lens = _estimate_lens(adjustment, frames, options, shot.first_focal)
+        shutter = shutter and shutter.known_with(lens)
+    if motion is None or lens is not None or shutter is not None:
+        motion = classify_motion(adjustment, o)
+    return _Core(core[kept], adjustment, motion, lens, shutter)
+
+
+def _first_guess(shot: Shot, frames: list[int], observations: Observations, tracks: Index, world: int) -> State:
     """Poses in the frame of one of the cameras, points triangulated from a few views, median inverse distance 1."""
+    images = [shot.images[position] for position in frames]
     rotation, origin = images[world].pose
     turn = np.array([i.rotation for i in images]) @ rotation.T
     translation = np.array([i.translation for i in images]) - turn @ origin
-    ids, points = map_points
+    ids, points = shot.map_points
     points = points @ rotation.T + origin
     distance = np.linalg.norm(points, axis=1)
     unit = float(np.median(1.0 / np.maximum(distance, 1e-6)))
-    translation = translation * unit
     mapped = np.isin(tracks, ids)
     at = np.searchsorted(ids, tracks[mapped])
     bearing, inverse = np.empty((len(tracks), 3)), np.empty(len(tracks))
     bearing[mapped] = points[at] / distance[at, None]
     inverse[mapped] = 1.0 / np.maximum(distance[at] * unit, 1e-3)
+    cameras = State(
+        turn, translation * unit, bearing, inverse, np.log(shot.guess.focal),
+        lens=shot.guess.shape, group=shot.group[frames], world=world,
+    )  # fmt: skip
     if not mapped.all():
         new = np.nonzero(~mapped)[0]
-        cameras = State(turn, translation, bearing[:0], inverse[:0], np.log(focal), group=group)
         result = _triangulated(cameras, observations, new, np.ones(len(new)))
         bearing[new], inverse[new] = result.bearing, result.inverse_distance
-    inverse = np.clip(inverse, 0.02, 20.0)
-    return State(turn, translation, bearing, inverse, np.log(focal), group=group, world=world)
+    return replace(cameras, bearing=bearing, inverse_distance=np.clip(inverse, 0.02, 20.0))
 
 
 def _triangulated(cameras: State, observations: Observations, points: Index, fallback: Array) -> Triangulation:
@@ -156,15 +151,7 @@ def _triangulated(cameras: State, observations: Observations, points: Index, fal
     place = np.arange(len(o.point)) - start[o.point]
     spaced = place * _TRIANGULATION_VIEWS // length > (place - 1) * _TRIANGULATION_VIEWS // length
     few = spaced | (place == length - 1)
-    return triangulate(
-        cameras.rotation,
-        cameras.translation,
-        o.at(few),
-        focal=float(np.median(cameras.focal)),
-        inlier_px=5.0,
-        sigma=FIRST_SIGMA_PX,
-        fallback=fallback,
-    )
+    return triangulate(cameras, o.at(few), inlier_px=5.0, sigma=FIRST_SIGMA_PX, fallback=fallback)
 
 
 def _world(observations: Observations) -> int:
@@ -173,28 +160,43 @@ def _world(observations: Observations) -> int:
     return int(np.argmax(count >= _WELL_HELD * count.max()))
 
 
-# --- stages -----------------------------------------------------------------------------------------------------------
-
-
 def _estimate_lens(
-    adjustment: BundleAdjustment,
-    guess: Lens,
-    frames: list[int],
-    options: Options,
-    first_focal: tuple[Array, float] | None,
+    adjustment: BundleAdjustment, frames: list[int], options: Options, first_focal: tuple[Array, float] | None
 ) -> tuple[BundleAdjustment, LensEstimate]:
     """As `estimate_lens`, with a focal length for every frame where a zoom is asked for and found."""
     zoom = None
-    if options.lens == "zoom" and len(guess.focal) == 1:
-        zoom = find_zoom(adjustment, guess, np.array(frames, np.float64), options.polish)
+    if options.lens == "zoom" and len(adjustment.state.log_focal) == 1:
+        zoom = find_zoom(adjustment, np.array(frames, np.float64), options.polish)
     if zoom is None or not zoom.found:
-        adjustment, lens = estimate_lens(adjustment, guess, options, first_focal=first_focal)
+        adjustment, lens = estimate_lens(adjustment, options, first_focal=first_focal)
         return adjustment, replace(lens, zoom_std=zoom.std if zoom else None)
-    zoomed = Lens(np.exp(zoom.adjustment.state.log_focal), guess.shape)
     prior = FocalPrior(np.zeros(len(frames)), zoom.information)
-    adjustment, lens = estimate_lens(zoom.adjustment, zoomed, options, prior)
-    seen = Lens(np.repeat(guess.focal, len(frames)), guess.shape)
-    return adjustment, replace(lens, guess=seen, zoom_std=zoom.std)
+    adjustment, lens = estimate_lens(zoom.adjustment, options, prior)
+    return adjustment, replace(lens, zoom_std=zoom.std)
+
+
+# --- all tracks -------------------------------------------------------------------------------------------------
+
+
+def _with_fitting_tracks(
+    part: State, core: _Core, observations: Observations, tracks: Index, options: PolishOptions
+) -> tuple[State, Observations, Index]:
+    """All points for the cameras of `part`, and the tracks that fit them."""
+    solved, points = core.adjustment, core.points
+    with_ray = np.asarray(np.isfinite(solved.state.normalized(observations)).all(axis=1))
+    if not with_ray.all():
+        observations, kept = _only(observations, with_ray)
+        tracks, points = tracks[kept], np.searchsorted(kept, points)
+    state = with_all_points(part, solved.state, observations, points)
+    adjustment = BundleAdjustment(
+        state, observations, replace(options, iterations=4), solved.errors, free=Free(cameras=False)
+    )
+    state, errors = adjustment.solve(), adjustment.reprojection_errors()
+    if options.observation_sigmas is None:
+        kept = _usual_points(observations, errors, options)
+        return state.of(kept), observations.of(kept), tracks[kept]
+    observations, kept = _only(observations, errors < options.observation_sigmas * solved.sigma)
+    return state.of(kept), observations, tracks[kept]
 
 
 def with_all_points(part: State, solved: State, observations: Observations, core: Index) -> State:
@@ -213,23 +215,16 @@ def with_all_points(part: State, solved: State, observations: Observations, core
     return replace(part, bearing=bearing, inverse_distance=inverse)
 
 
-def _without_outliers(
-    state: State, observations: Observations, tracks: Index, sigma: float, options: PolishOptions
-) -> tuple[Observations, Index, State]:
-    """Drop tracks whose typical error is far outside that of all tracks (log scale, robust)."""
-    errors = BundleAdjustment(state, observations, options, ErrorModel(sigma)).reprojection_errors()
+def _usual_points(observations: Observations, errors: Array, options: PolishOptions) -> Index:
+    """Points whose typical error is not far outside that of all points (log scale, robust)."""
     typical = np.log(np.sqrt(observations.mean_by_point(errors**2)) + 1e-6)
     center = np.median(typical)
     spread = 1.4826 * np.median(np.abs(typical - center))
-    keep = np.nonzero(typical < center + options.outlier_sigmas * max(spread, 0.1))[0]
-    return observations.of(keep), tracks[keep], state.of(keep)
+    return np.nonzero(typical < center + options.outlier_sigmas * max(spread, 0.1))[0]
 
 
-def _without_outlying_observations(
-    state: State, observations: Observations, tracks: Index, limit_px: float, options: PolishOptions
-) -> tuple[Observations, Index, State]:
-    """Drop wrong matches one by one, and tracks of which less than two observations remain."""
-    good = BundleAdjustment(state, observations, options, ErrorModel(1.0)).reprojection_errors() < limit_px
-    good &= np.bincount(observations.point, good, len(tracks))[observations.point] >= 2
-    keep = np.unique(observations.point[good])
-    return observations.at(good).of(keep), tracks[keep], state.of(keep)
+def _only(observations: Observations, good: NDArray[np.bool_]) -> tuple[Observations, Index]:
+    """The good observations of the points of which at least two are good, and these points."""
+    good = good & (np.bincount(observations.point, good)[observations.point] >= 2)
+    kept = np.unique(observations.point[good])
+    return observations.at(good).of(kept), kept

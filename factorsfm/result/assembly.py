@@ -16,7 +16,7 @@ from factorsfm.lens.camera_model import with_distortion
 from factorsfm.lens.lens import LensEstimate
 from factorsfm.lens.rolling_shutter import Shutter
 from factorsfm.mapping.mapped_images import MappedImage
-from factorsfm.polish.polish import Polished
+from factorsfm.polish.polished import Polished
 from factorsfm.priors.depth_map import DepthKind
 from factorsfm.result.frame_results import SourceFrame, frame_results
 from factorsfm.result.notes import result_notes
@@ -83,8 +83,8 @@ def assemble(
     has_depth = any(image.tracks.depth is not None for image in images)
     guessed = camera if polished.lens is None and not lens_given else None
     result.notes += result_notes(polished, result, guessed, depth_given=depth_kind is not None, has_depth=has_depth)
-    if polished.datum is not None:
-        _place(result, polished.datum)
+    if polished.world_alignment is not None:
+        _place(result, polished.world_alignment)
     return result
 
 
@@ -96,8 +96,8 @@ def _scale(polished: Polished, images: Sequence[MappedImage], depth_kind: DepthK
 
     A metric prior says ``1 / metres``, the polish ``scale / z``.
     """
-    if polished.datum is not None:
-        return polished.datum.scale
+    if polished.world_alignment is not None:
+        return polished.world_alignment.scale
     if depth_kind is not DepthKind.METRIC or polished.prior is None:
         return None
     depths = [images[polished.frames[row]].tracks.depth for row in polished.prior.images]
@@ -105,12 +105,12 @@ def _scale(polished: Polished, images: Sequence[MappedImage], depth_kind: DepthK
     return 1.0 / float(np.median(polished.state.scale * units))
 
 
-def _place(result: Reconstruction, datum: Similarity) -> None:
+def _place(result: Reconstruction, alignment: Similarity) -> None:
     """Turn and move a result, which has its size, into the world of its control."""
-    world_from_first = pycolmap.Rigid3d(pycolmap.Rotation3d(datum.rotation), datum.translation)
+    world_from_first = pycolmap.Rigid3d(pycolmap.Rotation3d(alignment.rotation), alignment.translation)
     for frame in result.registered:
         frame.cam_from_world = frame.cam_from_world * world_from_first.inverse()
-    result.points = result.points @ datum.rotation.T + datum.translation
+    result.points = result.points @ alignment.rotation.T + alignment.translation
 
 
 # --- points and observations --------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ import pycolmap
 
 from factorsfm.camera.projection import with_focal
 from factorsfm.mapping.mapped_images import MappedImage
-from factorsfm.polish.polish import Polished
+from factorsfm.polish.polished import Polished
 from factorsfm.result.reconstruction import FrameResult, PriorFit
 from factorsfm.support.status import FrameStatus, ShotKind
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from factorsfm.control.fit import ControlFit
 from factorsfm.lens.lens import LensEstimate
-from factorsfm.polish.polish import Polished
+from factorsfm.polish.polished import Polished
 from factorsfm.result.reconstruction import FrameResult, Reconstruction, RollingShutter
 from factorsfm.support.status import ShotKind
 

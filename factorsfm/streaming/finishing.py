@@ -10,12 +10,12 @@ import pycolmap
 from numpy.typing import NDArray
 
 from factorsfm.camera.guess import first_focal_std
-from factorsfm.camera.projection import normalized_from_pixels
 from factorsfm.control.known import Control, LocatedControl, locate
 from factorsfm.lens.camera_model import distortion_of
 from factorsfm.lens.rolling_shutter import Recording
 from factorsfm.mapping.mapper import Mapper
-from factorsfm.polish.polish import Polished, polish
+from factorsfm.polish.polish import polish
+from factorsfm.polish.polished import Polished
 from factorsfm.priors.depth import DepthPrior
 from factorsfm.result.assembly import assemble
 from factorsfm.result.reconstruction import Reconstruction
@@ -103,4 +103,4 @@ class EndedShot:
     def _located_control(self) -> LocatedControl | None:
         if self.control is None:
             return None
-        return locate(self.control, self.frames, lambda position, xy: normalized_from_pixels(self.camera, xy))
+        return locate(self.control, self.frames, lambda position, xy: (self.camera, xy))

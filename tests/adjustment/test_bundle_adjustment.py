@@ -56,7 +56,7 @@ def gtsam_optimum(problem, prior, start, sigma, kernel):
     graph.add(gtsam.NonlinearEqualityPose3(X(0), values.atPose3(X(0))))
     for j, point in enumerate(start.points):
         values.insert(L(j), point)
-    for k, j, pixel in zip(o.frame, o.point, problem.focal * o.xy, strict=True):
+    for k, j, pixel in zip(o.frame, o.point, o.pixels, strict=True):
         graph.add(gtsam.GenericProjectionFactorCal3_S2(pixel, pixel_noise, X(k), L(j), lens))
     values.insert(T(0), virtual_offset())
     graph.add(gtsam.NonlinearEqualityPose3(T(0), virtual_offset()))
@@ -82,7 +82,7 @@ def gtsam_optimum(problem, prior, start, sigma, kernel):
 @pytest.mark.parametrize("motion", ["truck", "handheld"])
 def test_the_optimum_is_that_of_gtsam(motion):
     problem = make_problem(motion, frames=6, points=60, parallax=0.1, noise_px=0.3)
-    problem.observations.xy[::17] += 0.01  # outliers, 6 pixels off
+    problem.observations.pixels[::17] += 6.0  # outliers
     prior, truth = with_prior(problem, [0, 2, 5])
     prior = replace(prior, node_weights=np.zeros_like(prior.node_weights))
     start = start_of(truth)
@@ -217,32 +217,29 @@ def test_translation_is_held_where_asked():
 @pytest.mark.parametrize("factor", [0.93, 1.08])
 def test_the_focal_length_is_recovered(factor):
     problem = make_problem("arc", parallax=0.3, points=150)
-    o = problem.observations
     guess = replace(perturbed(problem.truth), log_focal=problem.truth.log_focal + np.log(factor))
-    normalized = Observations(o.frame, o.point, o.xy / factor)
-    adjustment = BundleAdjustment(guess, normalized, EXACT, ErrorModel(0.25), free=Free(focal=True))
+    adjustment = BundleAdjustment(guess, problem.observations, EXACT, ErrorModel(0.25), free=Free(focal=True))
     state = adjustment.solve()
     np.testing.assert_allclose(np.exp(state.log_focal), problem.focal, rtol=2e-9)
     assert_cameras(state, problem.truth, angle_rad=2e-10, distance=1e-10)
-    held = BundleAdjustment(guess, normalized, EXACT, ErrorModel(0.25))
+    held = BundleAdjustment(guess, problem.observations, EXACT, ErrorModel(0.25))
     assert held.solve().log_focal == guess.log_focal
     assert held.cost() > 10.0
     assert adjustment.cost() < 1e-6 * held.cost()
 
 
 def test_groups_of_focal_lengths_are_recovered():
-    """Frames of three lenses, each normalised by a guess of its own."""
+    """Frames of three lenses, each with a guess of its own."""
     problem = make_problem("arc", parallax=0.3, points=150)
-    o, group = problem.observations, np.array([1, 0, 2, 1, 1, 0, 2, 2, 0, 1])
+    group = np.array([1, 0, 2, 1, 1, 0, 2, 2, 0, 1])
     factor = np.array([0.93, 1.05, 1.1])
     guess = replace(perturbed(problem.truth), log_focal=problem.truth.log_focal + np.log(factor), group=group)
-    normalized = Observations(o.frame, o.point, o.xy / factor[group[o.frame], None])
-    adjustment = BundleAdjustment(guess, normalized, EXACT, ErrorModel(0.25), free=Free(focal=True))
+    adjustment = BundleAdjustment(guess, problem.observations, EXACT, ErrorModel(0.25), free=Free(focal=True))
     state = adjustment.solve()
     np.testing.assert_allclose(np.exp(state.log_focal), problem.focal, rtol=1e-9)
     np.testing.assert_array_equal(state.group, group)
     assert_cameras(state, problem.truth, angle_rad=2e-10, distance=1e-10)
-    held = BundleAdjustment(guess, normalized, EXACT, ErrorModel(0.25))
+    held = BundleAdjustment(guess, problem.observations, EXACT, ErrorModel(0.25))
     np.testing.assert_array_equal(held.solve().log_focal, guess.log_focal)
 
 
@@ -294,8 +291,8 @@ def test_outliers_hardly_move_the_solution():
     problem = make_problem("handheld", points=150, noise_px=0.1)
     clean = BundleAdjustment(perturbed(problem.truth), problem.observations, EXACT, ErrorModel(0.1)).solve()
     rng = np.random.default_rng(5)
-    wild = rng.random(len(problem.observations.xy)) < 0.05
-    problem.observations.xy[wild] += rng.normal(0, 0.03, (wild.sum(), 2))
+    wild = rng.random(len(problem.observations.pixels)) < 0.05
+    problem.observations.pixels[wild] += problem.focal * rng.normal(0, 0.03, (wild.sum(), 2))
     robbed = BundleAdjustment(perturbed(problem.truth), problem.observations, EXACT, ErrorModel(0.1))
     state = robbed.solve()
     assert_cameras(clean, problem.truth, angle_rad=5e-4, distance=5e-4)
@@ -305,10 +302,10 @@ def test_outliers_hardly_move_the_solution():
 
 def test_reprojection_vectors_are_predicted_minus_observed():
     problem = make_problem("truck")
-    problem.observations.xy[3] += [0.01, -0.02]
+    problem.observations.pixels[3] += [6.0, -12.0]
     adjustment = BundleAdjustment(problem.truth, problem.observations, EXACT, ErrorModel(0.25))
-    expected = np.zeros((len(problem.observations.xy), 2))
-    expected[3] = -problem.focal * np.array([0.01, -0.02])
+    expected = np.zeros((len(problem.observations.pixels), 2))
+    expected[3] = [-6.0, 12.0]
     np.testing.assert_allclose(adjustment.reprojection_vectors(), expected, rtol=0.0, atol=1e-11)
     np.testing.assert_allclose(adjustment.reprojection_errors(), np.linalg.norm(expected, axis=1), rtol=0.0, atol=1e-11)
 
@@ -316,8 +313,9 @@ def test_reprojection_vectors_are_predicted_minus_observed():
 def test_unsorted_observations_are_refused():
     problem = make_problem("truck")
     o = problem.observations
+    backwards = Observations(o.frame[::-1], o.point[::-1], o.pixels[::-1])
     with pytest.raises(ValueError, match="sorted by point"):
-        BundleAdjustment(problem.truth, Observations(o.frame[::-1], o.point[::-1], o.xy[::-1]), EXACT, ErrorModel(0.25))
+        BundleAdjustment(problem.truth, backwards, EXACT, ErrorModel(0.25))
 
 
 # --- uncertainty ------------------------------------------------------------------------------------------------

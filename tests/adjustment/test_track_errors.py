@@ -25,7 +25,7 @@ def drawn(observations, persistent, seed=0):
 
 def with_errors(problem, error):
     o = problem.observations
-    return Observations(o.frame, o.point, o.xy + error / problem.focal)
+    return Observations(o.frame, o.point, o.pixels + error)
 
 
 @pytest.fixture(scope="module")

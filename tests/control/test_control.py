@@ -30,10 +30,11 @@ from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.marginals import in_scene_unit
 from factorsfm.adjustment.problem import ErrorModel, Known
 from factorsfm.adjustment.state import State
+from factorsfm.camera.projection import PIXEL_CENTER
 from factorsfm.cli import main as cli
 from factorsfm.control.known import LocatedControl, locate
 from factorsfm.control.residuals import (
-    DATUM,
+    ALIGNMENT,
     ControlTerm,
     DistanceItem,
     HeightItem,
@@ -50,7 +51,15 @@ from factorsfm.support.similarity import Similarity, align, pose_arrays
 from factorsfm.synthetic import render_shot, write_shot
 from tests.calibration import assert_calibrated, normalised
 from tests.command_line import assert_error
-from tests.estimation_problems import Problem, centers, make_problem, mapped_images, perturbed, rotation_matrices
+from tests.estimation_problems import (
+    Problem,
+    centers,
+    make_problem,
+    mapped_images,
+    perturbed,
+    pinhole,
+    rotation_matrices,
+)
 
 WORLD = Similarity(2.5, rotation_matrices([0.4, -1.1, 0.7])[0], np.array([120.0, -45.0, 7.0]))  # of the control
 SIGMA = 0.002  # metres
@@ -66,7 +75,7 @@ def every_item(problem: Problem) -> list[Item]:
         PositionItem("camera", Place(2, camera=True), rng.standard_normal(3), 0.1),
         PositionItem("point", Place(1), rng.standard_normal(3), 0.2),
         RotationItem("rotation", 3, known @ problem.truth.rotation[3] @ WORLD.rotation.T, 3.0),
-        MarkItem("mark", 1, Place(0), np.array([0.1, -0.2]), 2.0),
+        MarkItem("mark", 1, Place(0), problem.focal * np.array([0.1, -0.2]), 2.0),
         DistanceItem("cameras", (Place(1, camera=True), Place(4, camera=True)), 0.3, 0.05),
         DistanceItem("points", (Place(0), Place(2)), 2.0, 0.1),
         DistanceItem("both", (Place(3, camera=True), Place(1)), 2.0, 0.1),
@@ -75,13 +84,14 @@ def every_item(problem: Problem) -> list[Item]:
 
 
 def linear_point() -> tuple[Problem, State, ControlTerm]:
-    """A state away from the truth, whose datum is turned by half a radian from its start."""
+    """A state away from the truth, whose world alignment is turned by half a radian from its start."""
     problem = make_problem("handheld", frames=5, points=30, parallax=0.2)
     marked = np.array([[0.3, 0.2, 1.1], [-0.2, 0.1, 1.4], [0.1, -0.3, 0.9]])
     control = np.concatenate([[0.3, -0.4, 0.2], WORLD.translation / 50, [0.5], marked.ravel()])
     focal = problem.truth.log_focal + [0.0, 0.2]
-    state = replace(perturbed(problem.truth), control=control, log_focal=focal, group=np.arange(5) % 2)
-    free = np.ones(DATUM + 9, bool)
+    lens = np.array([-0.1, 0.05, 0.003, 0.002, 0.0, 0.0])
+    state = replace(perturbed(problem.truth), control=control, log_focal=focal, group=np.arange(5) % 2, lens=lens)
+    free = np.ones(ALIGNMENT + 9, bool)
     return problem, state, ControlTerm(every_item(problem), WORLD.rotation, np.array([0.1, 0.2, -0.1]), free, 2.0)
 
 
@@ -92,7 +102,7 @@ def test_each_residual_has_the_derivative_of_its_value(number: int) -> None:
         state, problem.observations, PolishOptions(), ErrorModel(1.0), known=Known(control=term)
     )
     item = term.items[number]
-    residual, columns, derivative = item.linearized(term.view(state))
+    residual, columns, derivative = item.linearized(term.aligned(state))
     assert derivative.shape == (len(residual), len(columns))
     numeric = np.zeros_like(derivative)
     for at, column in enumerate(columns):
@@ -101,7 +111,7 @@ def test_each_residual_has_the_derivative_of_its_value(number: int) -> None:
             step = np.zeros(adjustment.columns.size)
             step[column] = sign * 1e-6
             moved = adjustment._retract(step, np.zeros((len(state.bearing), 3)))
-            values.append(item.linearized(term.view(moved))[0])
+            values.append(item.linearized(term.aligned(moved))[0])
         numeric[:, at] = (values[0] - values[1]) / 2e-6
     np.testing.assert_allclose(derivative, numeric, rtol=1e-8, atol=1e-9 * np.abs(numeric).max())
     assert (np.abs(numeric).max(axis=0) > 1.0).all()  # every column takes part
@@ -114,7 +124,7 @@ def test_the_gradient_of_the_adjustment_is_that_of_its_cost() -> None:
     )
     normal = adjustment._linearize()
     n, size = len(state.bearing), len(normal.camera_gradient)
-    assert size == 6 * 5 + 2 + 6 + DATUM + 9
+    assert size == 6 * 5 + 2 + 6 + ALIGNMENT + 9
     numeric = np.zeros(size)
     for column in range(size):
         step = np.zeros(size)
@@ -127,7 +137,7 @@ def test_the_gradient_of_the_adjustment_is_that_of_its_cost() -> None:
 
 
 def test_the_control_does_not_know_the_unit_of_the_polish() -> None:
-    """Cameras, marked points and datum, carried along with the unit, leave every residual but the marks' as it is."""
+    """Cameras, points and alignment, carried along with the unit, leave every residual but the marks' as it is."""
     problem, state, term = linear_point()
     adjustment = BundleAdjustment(
         state, problem.observations, PolishOptions(), ErrorModel(1.0), known=Known(control=term)
@@ -139,7 +149,7 @@ def test_the_control_does_not_know_the_unit_of_the_polish() -> None:
         return motion
 
     marginals = SimpleNamespace(camera=adjustment.marginals().camera, relative=relative)
-    in_scene_unit(marginals, state, _by_size(state, term.view(state)))  # type: ignore[arg-type]
+    in_scene_unit(marginals, state, _by_size(term.aligned(state)))  # type: ignore[arg-type]
     before = term.residuals(state)
     moved = adjustment._retract(1e-4 * seen["motion"], np.zeros((len(state.bearing), 3)))
     for old, new in zip(before, term.residuals(moved), strict=True):
@@ -155,8 +165,7 @@ def named_frames(problem: Problem) -> list[Any]:
 
 
 def located(problem: Problem, control: Control) -> LocatedControl:
-    """Pixels are normalised coordinates times the focal length here."""
-    return locate(control, named_frames(problem), lambda position, xy: xy / problem.focal)
+    return locate(control, named_frames(problem), lambda position, xy: (pinhole(problem.focal), xy))
 
 
 def true_centers(problem: Problem) -> np.ndarray:
@@ -178,7 +187,8 @@ def known_pose(
 
 def marked_point(problem: Problem, point: int, sigma: float | None, off: Any = 0.0) -> MarkedPoint:
     o = problem.observations
-    pixels = {10 + k: problem.focal * o.xy[(o.frame == k) & (o.point == point)][0] for k in (0, 4, 9)}
+    center = np.array([320.0, 180.0]) - PIXEL_CENTER
+    pixels = {10 + k: center + o.pixels[(o.frame == k) & (o.point == point)][0] for k in (0, 4, 9)}
     position = WORLD.points(problem.points[point][None])[0] + off if sigma is not None else None
     return MarkedPoint(f"P{point}", pixels, 0.3, position, sigma)
 
@@ -195,9 +205,10 @@ def solve(problem: Problem, control: Control | None, start: State | None = None)
 
 def placed(result: Polished) -> tuple[np.ndarray, np.ndarray]:
     """cam_from_world rotations and centres in the control's world."""
-    assert result.datum is not None
+    assert result.world_alignment is not None
     s = result.state
-    return s.rotation @ result.datum.rotation.T, result.datum.points(centers(s.rotation, s.translation))
+    alignment = result.world_alignment
+    return s.rotation @ alignment.rotation.T, alignment.points(centers(s.rotation, s.translation))
 
 
 def assert_at_truth(result: Polished, problem: Problem) -> None:
@@ -252,8 +263,8 @@ def test_without_noise_the_world_of_the_control_is_found_exactly(kind: str, exac
     result = solve(exact, controls(exact)[kind])
     assert_at_truth(result, exact)
     assert result.control is not None
-    assert result.datum is not None
-    assert result.datum.scale == pytest.approx(WORLD.scale * unit_of(result, exact), rel=1e-10)
+    assert result.world_alignment is not None
+    assert result.world_alignment.scale == pytest.approx(WORLD.scale * unit_of(result, exact), rel=1e-10)
     assert all(residual.sigmas < 1e-10 and not residual.contradicts for residual in result.control.residuals)
     assert not result.control.unused
     assert result.control.placed
@@ -275,9 +286,9 @@ def test_control_that_turns_the_path_round_leaves_no_scene(exact: Problem) -> No
 def test_a_distance_alone_gives_the_scale(exact: Problem) -> None:
     length = float(np.linalg.norm(true_centers(exact)[0] - true_centers(exact)[9]))
     result = solve(exact, Control(distances=[KnownDistance(length, SIGMA, (10, 19))]))
-    assert result.datum is not None
-    assert result.datum.scale == pytest.approx(WORLD.scale * unit_of(result, exact), rel=1e-11)
-    np.testing.assert_allclose(result.datum.rotation, np.eye(3))
+    assert result.world_alignment is not None
+    assert result.world_alignment.scale == pytest.approx(WORLD.scale * unit_of(result, exact), rel=1e-11)
+    np.testing.assert_allclose(result.world_alignment.rotation, np.eye(3))
     np.testing.assert_allclose(result.state.translation[0], 0.0, atol=1e-12)
     assert result.control is not None
     assert result.control.scale_std == pytest.approx(SIGMA / length, rel=0.004)
@@ -295,14 +306,14 @@ def test_noise_of_the_control_shows_in_the_scale_as_foretold() -> None:
         known = [known_pose(problem, k, 0.02, noise=0.02 * rng.standard_normal(3)) for k in range(0, 10, 2)]
         result = solve(problem, Control(known))
         assert result.control is not None
-        assert result.datum is not None
+        assert result.world_alignment is not None
         rotation, position = placed(result)
         spread = np.linalg.norm(true_centers(problem)[::2] - true_centers(problem)[::2].mean(axis=0))
         assert 0.95 < result.control.scale_std * spread / 0.02 < 1.2  # the scene adds a little of its own
         mean = 1 / np.mean(result.state.inverse_distance / problem.truth.inverse_distance[result.tracks])
-        scales.append(((np.log(result.datum.scale * mean / WORLD.scale) / result.control.scale_std) ** 2, 1))
+        scales.append(((np.log(result.world_alignment.scale * mean / WORLD.scale) / result.control.scale_std) ** 2, 1))
         for k, trials in poses.items():
-            covariance = result.covariance[k] * np.outer(*2 * [np.repeat([1.0, result.datum.scale], 3)])
+            covariance = result.covariance[k] * np.outer(*2 * [np.repeat([1.0, result.world_alignment.scale], 3)])
             turn = cv2.Rodrigues(true_cam_from_world(problem)[k] @ rotation[k].T)[0][:, 0]
             off = np.append(turn, rotation[k] @ (position[k] - true_centers(problem)[k]))
             trials.append(normalised(off, covariance))
@@ -480,10 +491,10 @@ def test_frames_are_found_by_name_stem_or_index(exact: Problem) -> None:
     frames = [SimpleNamespace(index=10 + k, name=f"{k:03d}.jpg") for k in range(4)]
     keys: list[str | int] = ["002.jpg", "001", 13, "10"]
     control = Control([KnownPose(key, [k, k * k, 0], 0.1) for k, key in enumerate(keys)])
-    found = locate(control, frames, lambda position, xy: xy)
+    found = locate(control, frames, lambda position, xy: (pinhole(500.0), xy))
     assert [found.position[key] for key in keys] == [2, 1, 3, 0]
     with pytest.raises(InputError, match="control: there is no frame 99 among the 4 frames"):
-        locate(Control(distances=[KnownDistance(1, 0.1, [99, 10])]), frames, lambda position, xy: xy)
+        locate(Control(distances=[KnownDistance(1, 0.1, [99, 10])]), frames, lambda position, xy: (pinhole(500.0), xy))
 
 
 @pytest.mark.parametrize(

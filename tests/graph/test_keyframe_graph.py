@@ -59,7 +59,7 @@ class Shot:
         images = [self.images[k] for k in frames]
         if ids is None:
             ids = np.arange(len(self.points) if max(frames) >= 2 else self.half)
-        o = gather([image.tracks for image in images], ids)
+        o = gather([image.tracks for image in images], ids, self.problem.focal)
         return Window(
             positions=np.array(list(frames)),
             constant=np.arange(len(images)) < constant,
@@ -69,7 +69,7 @@ class Shot:
             points=self.points[ids],
             frame=o.frame,
             point=o.point,
-            pixels=self.problem.focal * o.xy,
+            pixels=o.pixels,
             focal=self.problem.focal,
             sigma=SIGMA,
             depths=self._depths(images, ids),
@@ -279,7 +279,7 @@ def test_the_result_is_the_minimum_of_its_factors(guided, constant):
 
 def batch_problem(window):
     """The same problem without the prior for the batch solver."""
-    observations = Observations(window.frame, window.point, window.pixels / window.focal)
+    observations = Observations(window.frame, window.point, window.pixels)
     return BundleAdjustment(
         state_of(window), observations, EXACT, ErrorModel(window.sigma), free=Free(held=window.constant)
     )

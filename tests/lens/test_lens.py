@@ -11,16 +11,16 @@ from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.noise import image_cells
 from factorsfm.adjustment.observations import Observations, Sweep
 from factorsfm.adjustment.problem import ErrorModel, FocalPrior, Free, Known, LensPrior
-from factorsfm.adjustment.residuals import distort
+from factorsfm.adjustment.residuals import distort, undistort
 from factorsfm.adjustment.state import LENS_SIZE
 from factorsfm.camera.guess import guess_camera
 from factorsfm.camera.projection import PIXEL_CENTER, normalized_from_pixels
 from factorsfm.cli.main import main
 from factorsfm.lens.camera_model import distortion_of, with_distortion
 from factorsfm.lens.certainty import _left_out_covariance, lens_covariances
-from factorsfm.lens.estimate import _solved_as_it_moves, solved_with_lens
-from factorsfm.lens.lens import Lens, renormalized, through, undistort
+from factorsfm.lens.lens import through
 from factorsfm.lens.search import search_lens
+from factorsfm.lens.solver import LensSolver
 from factorsfm.polish.camera_starts import _everywhere
 from factorsfm.polish.polish import polish
 from factorsfm.result.notes import lens_note
@@ -35,17 +35,19 @@ STRONG_BARREL = np.array([-0.3, 0.08, 0.0, 0.0, 0.0, 0.0])
 
 def estimated(problem, *, guess=1.3, shape=None, lens="distortion", first_std=None):
     """The polish of a problem whose lens has a shape, from tracks that a guess normalised without it."""
-    truth = Lens(np.array([problem.focal]))
-    seen = replace(
-        problem.observations, xy=distort(problem.observations.xy, np.zeros(4) if shape is None else shape)[0]
-    )
-    wrong = Lens(guess * truth.focal)
-    start = through(problem.truth, wrong.focal)
-    images = mapped_images(replace(problem, observations=renormalized(seen, truth, wrong, start.group)), start)
+    wrong = np.array([guess * problem.focal])
+    start = through(problem.truth, wrong)
+    images = mapped_images(seen_through(problem, np.zeros(4) if shape is None else shape), start, guess=guess)
     points = np.arange(len(start.bearing)), start.points
     options = replace(Options.preset_named("geometry"), lens=lens)
-    first = None if first_std is None else (wrong.focal, first_std)
-    return polish(images, points, wrong.focal, options, first_focal=first)
+    first = None if first_std is None else (wrong, first_std)
+    return polish(images, points, wrong, options, first_focal=first)
+
+
+def seen_through(problem, shape):
+    """The problem with distorted observations."""
+    pixels = problem.focal * distort(problem.xy, shape)[0]
+    return replace(problem, observations=replace(problem.observations, pixels=pixels))
 
 
 def assert_derivative(analytic, function, size, step=1e-6):
@@ -78,7 +80,7 @@ def test_the_gradient_of_the_lens_columns_is_that_of_the_cost(kernel, group):
     information = np.cov(np.random.default_rng(0).standard_normal((groups, 9))).reshape(groups, groups)
     sigmas = np.array([0.1, 0.1, 0.02, 0.02, 1.0, 1.0])
     options = PolishOptions(kernel=kernel)
-    random = np.random.default_rng(1).standard_normal((3, len(problem.observations.xy), 2))
+    random = np.random.default_rng(1).standard_normal((3, len(problem.observations.pixels), 2))
     observations = replace(problem.observations, sweep=Sweep(20.0 * random[0], 5.0 * random[1], random[2]))
     adjustment = BundleAdjustment(
         start,
@@ -125,15 +127,12 @@ def test_a_new_focal_length_leaves_the_first_image_as_it_is():
 def test_the_lenses_of_several_cameras_are_found():
     problem = make_problem("arc", frames=10, points=200, parallax=0.3, noise_px=0.05)
     groups = np.array([0, 0, 1, 1, 2, 2, 1, 0, 2, 1])
-    truth = Lens(problem.focal * np.array([1.0, 1.0, 1.0]))
-    wrong = Lens(problem.focal * np.array([1.3, 1.15, 1.4]))
+    guess = np.array([1.3, 1.15, 1.4])
     start = through(problem.truth, np.array([1.3 * problem.focal]))
-    images = mapped_images(
-        replace(problem, observations=renormalized(problem.observations, truth, wrong, groups)), start
-    )
+    images = mapped_images(problem, start, guess=guess[groups])
     options = replace(Options.preset_named("geometry"), lens="focal")
     points = np.arange(len(start.bearing)), start.points
-    result = polish(images, points, wrong.focal, options, groups=groups)
+    result = polish(images, points, guess * problem.focal, options, groups=groups)
     assert result.lens.determined
     error = np.log(result.lens.lens.focal / problem.focal)
     assert 3e-4 < np.abs(error).max() < 2e-3
@@ -190,11 +189,10 @@ def test_errors_as_long_as_a_track_lives_count_once():
     for seed in range(6):
         problem = make_problem("arc", frames=24, points=120, parallax=0.3, noise_px=0.02, seed=seed)
         o = problem.observations
-        speed = 0.3 * np.random.default_rng(seed).standard_normal((len(problem.points), 2)) / problem.focal
-        slid = o.xy + speed[o.point] * (o.frame / problem.frames)[:, None]
-        adjustment = solved_with_lens(
-            problem.truth, replace(o, xy=slid), PolishOptions(tolerance=1e-6), 0.1, np.zeros(LENS_SIZE)
-        )  # fmt: skip
+        speed = 0.3 * np.random.default_rng(seed).standard_normal((len(problem.points), 2))
+        slid = o.pixels + speed[o.point] * (o.frame / problem.frames)[:, None]
+        solver = LensSolver(replace(o, pixels=slid), PolishOptions(tolerance=1e-6))
+        adjustment = solver.solved(problem.truth, 0.1, np.zeros(LENS_SIZE))
         std = np.sqrt(max(c[0, 0] for c in lens_covariances(adjustment)))
         off.append((adjustment.state.log_focal[0] - np.log(problem.focal)) / std)
     assert 0.35 < np.sqrt(np.mean(np.square(off))) < 0.9
@@ -204,9 +202,8 @@ def test_what_is_left_out_tells_as_much_as_independent_errors_do():
     errors, said = [], []
     for seed in range(6):
         problem = make_problem("arc", frames=9, points=150, parallax=0.3, noise_px=0.2, seed=seed)
-        solved = solved_with_lens(
-            problem.truth, problem.observations, PolishOptions(tolerance=1e-6), 0.2, np.zeros(LENS_SIZE)
-        )  # fmt: skip
+        solver = LensSolver(problem.observations, PolishOptions(tolerance=1e-6))
+        solved = solver.solved(problem.truth, 0.2, np.zeros(LENS_SIZE))
         errors.append(solved.state.log_focal[0] - np.log(problem.focal))
         said.append(np.sqrt(_left_out_covariance(solved)[0, 0] / lens_covariances(solved)[0][0, 0]))
     assert 0.8 < np.median(said) < 1.4
@@ -218,11 +215,10 @@ def test_what_is_left_out_shows_that_parts_of_the_shot_disagree():
     for seed in range(6):
         problem = make_problem("arc", frames=9, points=150, parallax=0.3, noise_px=0.02, seed=seed)
         o = problem.observations
-        part = image_cells(o.xy, 3, 2) + 6 * (o.frame // 3)
-        shift = 0.5 / problem.focal * np.random.default_rng(seed).standard_normal((18, 2))
-        solved = solved_with_lens(
-            problem.truth, replace(o, xy=o.xy + shift[part]), PolishOptions(tolerance=1e-6), 0.3, np.zeros(LENS_SIZE)
-        )  # fmt: skip
+        part = image_cells(o.pixels, 3, 2) + 6 * (o.frame // 3)
+        shift = 0.5 * np.random.default_rng(seed).standard_normal((18, 2))
+        solver = LensSolver(replace(o, pixels=o.pixels + shift[part]), PolishOptions(tolerance=1e-6))
+        solved = solver.solved(problem.truth, 0.3, np.zeros(LENS_SIZE))
         error = solved.state.log_focal[0] - np.log(problem.focal)
         off["within"].append(error / np.sqrt(max(c[0, 0] for c in lens_covariances(solved))))
         off["left out"].append(error / np.sqrt(_left_out_covariance(solved)[0, 0]))
@@ -275,12 +271,10 @@ def test_a_focal_length_that_is_not_determined_is_the_mean_of_guess_and_estimate
 @pytest.mark.parametrize(("motion", "parallax"), [("rotation", 0.0), ("arc", 0.3)])
 def test_a_translation_that_is_none_does_not_bend_with_the_lens(motion, parallax):
     problem = make_problem(motion, frames=8, points=150, parallax=parallax, noise_px=0.05)
-    seen = replace(problem.observations, xy=distort(problem.observations.xy, BARREL)[0])
+    solver = LensSolver(seen_through(problem, BARREL).observations, PolishOptions(tolerance=1e-5))
     bent = replace(problem.truth, translation=problem.truth.translation + 0.01 * np.eye(8, 3))
-    solved, moves = _solved_as_it_moves(
-        replace(bent, translation=bent.translation - bent.translation[0]), seen, PolishOptions(tolerance=1e-5), 0.05,
-        np.array([0.1, 0.1, 0.0, 0.0, 0.0, 0.0]), None,
-    )  # fmt: skip
+    start = replace(bent, translation=bent.translation - bent.translation[0])
+    solved, moves = solver.solved_as_it_moves(start, 0.05, np.array([0.1, 0.1, 0.0, 0.0, 0.0, 0.0]))
     assert moves == (motion == "arc")
     assert solved.state.translation.any() == moves
     np.testing.assert_allclose(solved.state.lens, BARREL, atol=0.004)
@@ -302,7 +296,7 @@ def test_distortion_is_recovered_over_the_image(lens):
     found = estimated(problem, guess=1.2, shape=shape, lens=lens).lens
     assert found.determined
     assert 1e-3 < found.shape_std[:2].max() < 0.012
-    xy = problem.observations.xy
+    xy = problem.xy
     truth = problem.focal * distort(xy, shape)[0]
     off = np.linalg.norm(found.lens.focal * distort(xy, found.lens.shape)[0] - truth, axis=1)
     assert 0.2 < np.percentile(off, 99) < (0.5 if lens == "distortion" else 1.5)
@@ -323,11 +317,10 @@ def test_strong_distortion_is_found_with_the_focal_length(motion, parallax, gues
 def test_the_search_sees_through_distortion_where_it_may():
     """Without distortion, the best focal length is one with which the tracks do not fit."""
     problem = make_problem("arc", frames=10, points=200, parallax=0.1, noise_px=0.05)
-    seen = replace(problem.observations, xy=distort(problem.observations.xy, STRONG_BARREL)[0])
-    guess = Lens(np.array([problem.focal]))
+    seen = seen_through(problem, STRONG_BARREL).observations
     adjustment = BundleAdjustment(problem.truth, seen, PolishOptions(), ErrorModel(0.2))
-    straight, cost = search_lens(adjustment, guess, PolishOptions())
-    bent, bent_cost = search_lens(adjustment, guess, PolishOptions(), np.array([0.1, 0.1, 0.0, 0.0, 0.0, 0.0]))
+    straight, cost = search_lens(adjustment, PolishOptions())
+    bent, bent_cost = search_lens(adjustment, PolishOptions(), np.array([0.1, 0.1, 0.0, 0.0, 0.0, 0.0]))
     assert not straight.shape.any()
     assert bent_cost < 0.5 * cost
     assert bent.focal[0] == pytest.approx(problem.focal, rel=0.1)
@@ -342,7 +335,7 @@ def test_distortion_alone_is_recovered_and_the_focal_length_stays_as_given():
     assert not found.focal_std.any()
     assert found.lens.focal == pytest.approx(problem.focal, rel=1e-6)
     assert lens_note(found).startswith("The focal length is as it was given; radial distortion k1 -0.1")
-    xy = problem.observations.xy
+    xy = problem.xy
     off = problem.focal * np.linalg.norm(distort(xy, found.lens.shape)[0] - distort(xy, BARREL)[0], axis=1)
     assert 0.1 < np.percentile(off, 99) < 0.3
     straight = estimated(problem, guess=1.0, lens="radial").lens
@@ -387,7 +380,9 @@ def test_a_match_that_is_seen_far_outside_of_the_image_says_nothing_of_the_disto
     seen = np.concatenate([q[:, :2] / q[:, 2:], [[0.1, -0.05]]])
     assert np.abs(seen).max() < 0.5
     observations = Observations(
-        np.append(o.frame, [0, 1, 2, 5]), np.append(o.point, np.full(4, n)), np.concatenate([o.xy, seen])
+        np.append(o.frame, [0, 1, 2, 5]),
+        np.append(o.point, np.full(4, n)),
+        np.concatenate([o.pixels, problem.focal * seen]),
     )
     start = replace(
         truth,

@@ -30,12 +30,11 @@ def polished(motion, zoom, *, parallax, guess=1.15, max_frames=400, noise_px=0.0
     problem = make_problem(motion, frames=FRAMES, points=200, parallax=parallax, noise_px=noise_px)
     o = problem.observations
     start = through(problem.truth, guess * np.exp(problem.truth.log_focal))
-    factor = profile(zoom) / guess
-    seen = replace(problem, observations=replace(o, xy=o.xy * factor[o.frame, None]))
+    seen = replace(problem, observations=replace(o, pixels=o.pixels * profile(zoom)[o.frame, None]))
     options = replace(Options.preset_named("geometry"), lens="zoom")
     options = replace(options, polish=replace(options.polish, max_frames=max_frames))
     points = np.arange(len(start.bearing)), start.points
-    result = polish(mapped_images(seen, start), points, guess * np.exp(problem.truth.log_focal), options)
+    result = polish(mapped_images(seen, start, guess=guess), points, guess * np.exp(problem.truth.log_focal), options)
     return problem, result
 
 

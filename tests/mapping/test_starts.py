@@ -166,7 +166,7 @@ def test_the_essential_matrix_with_noise_and_outliers():
     problem = make_problem("truck", parallax=0.2, points=300, noise_px=0.2)
     o = problem.observations
     wild = (o.point % 4 == 0) & (o.frame == 9)
-    o.xy[wild] += np.random.default_rng(0).uniform(0.02, 0.1, (wild.sum(), 2))
+    o.pixels[wild] += problem.focal * np.random.default_rng(0).uniform(0.02, 0.1, (wild.sum(), 2))
     start = essential(problem, 9)
     assert isinstance(start, Start)
     assert_similar(start, problem, angle_rad=5e-3, relative=0.007)

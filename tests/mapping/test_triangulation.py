@@ -9,12 +9,9 @@ SETTINGS = {"inlier_px": 3.0, "sigma": 0.25}
 
 
 def run(problem, observations=None, *, fallback=1.0, **kwargs):
-    truth = problem.truth
     return triangulate(
-        truth.rotation,
-        truth.translation,
+        problem.truth,
         observations or problem.observations,
-        focal=problem.focal,
         fallback=np.full(len(problem.points), fallback),
         **SETTINGS,
         **kwargs,
@@ -82,7 +79,7 @@ def test_outliers_among_the_views_are_left_out(wild_frames):
     problem = make_problem("truck", parallax=0.2, noise_px=0.1)
     o = problem.observations
     every_third = (o.point % 3 == 0) & np.isin(o.frame, wild_frames)
-    o.xy[every_third] += [0.02, 0.05]  # 30 pixels
+    o.pixels[every_third] += problem.focal * np.array([0.02, 0.05])  # 30 pixels
     result = run(problem)
     expected = np.where(np.arange(len(problem.points)) % 3 == 0, problem.frames - len(wild_frames), problem.frames)
     np.testing.assert_array_equal(result.inliers, expected)
@@ -94,10 +91,8 @@ def test_without_parallax_the_fallback_decides():
     n = len(problem.points)
     fallback = np.linspace(0.5, 2, n)
     result = triangulate(
-        problem.truth.rotation,
-        problem.truth.translation,
+        problem.truth,
         problem.observations,
-        focal=problem.focal,
         fallback=fallback,
         **SETTINGS,
     )
@@ -111,9 +106,9 @@ def test_one_view_alone_is_lifted_to_the_fallback():
     problem = make_problem("truck")
     o = problem.observations
     lonely = o.frame == 4
-    result = run(problem, Observations(o.frame[lonely], o.point[lonely], o.xy[lonely]), fallback=0.8)
+    result = run(problem, Observations(o.frame[lonely], o.point[lonely], o.pixels[lonely]), fallback=0.8)
     center = -problem.truth.rotation[4].T @ problem.truth.translation[4]
-    rays = np.concatenate([o.xy[lonely], np.ones((lonely.sum(), 1))], 1) @ problem.truth.rotation[4]
+    rays = np.concatenate([problem.xy[lonely], np.ones((lonely.sum(), 1))], 1) @ problem.truth.rotation[4]
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     np.testing.assert_allclose(points_of(result), center + rays / 0.8, rtol=0.0, atol=1e-13)
     assert (result.inliers == 1).all()
@@ -125,7 +120,7 @@ def test_tracks_of_different_lengths():
     o = problem.observations
     keep = (o.frame + o.point) % 4 != 0  # every track misses other frames
     keep &= (o.point % 5 != 0) | (o.frame >= 6)
-    result = run(problem, Observations(o.frame[keep], o.point[keep], o.xy[keep]))
+    result = run(problem, Observations(o.frame[keep], o.point[keep], o.pixels[keep]))
     np.testing.assert_array_equal(result.inliers, np.bincount(o.point[keep]))
     seen_long = o.point[keep & (o.frame < 3)]
     some = np.isin(np.arange(len(problem.points)), seen_long)
@@ -139,7 +134,7 @@ def test_distant_points_stay_far_away(inverse_distance):
     problem = make_problem("truck", parallax=0.1)
     truth, o = problem.truth, problem.observations
     q = np.einsum("kij,nj->nki", truth.rotation, truth.bearing) + inverse_distance * truth.translation
-    o.xy[:] = (q[..., :2] / q[..., 2:]).reshape(-1, 2)
+    o.pixels[:] = problem.focal * (q[..., :2] / q[..., 2:]).reshape(-1, 2)
     result = run(problem)
     supported = result.inliers == problem.frames
     assert supported.mean() > 0.9  # at infinity itself rounding puts some beyond, where no hypothesis is accepted

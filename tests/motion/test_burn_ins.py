@@ -11,7 +11,7 @@ from factorsfm.mapping.map_copy import MapCopy
 from factorsfm.mapping.map_update import update_map
 from factorsfm.mapping.point_map import PointMap
 from factorsfm.motion.burn_ins import resting
-from factorsfm.polish.camera_starts import converge_cameras
+from factorsfm.polish.camera_starts import start_cameras
 from factorsfm.support.options import MapperOptions, Options, TrackerOptions
 from factorsfm.tracks.flow import FlowTracker
 from tests.estimation_problems import angles_between, make_problem, mapped_images, perturbed
@@ -27,7 +27,7 @@ def captioned(motion, parallax, count=CAPTIONS):
     observations = Observations(
         np.r_[o.frame, np.tile(np.arange(k), count)],
         np.r_[o.point, np.repeat(n + np.arange(count), k)],
-        np.r_[o.xy, np.repeat(at, k, 0)],
+        np.r_[o.pixels, problem.focal * np.repeat(at, k, 0)],
     )
     rays = np.column_stack([at, np.ones(count)])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -42,20 +42,20 @@ def captioned(motion, parallax, count=CAPTIONS):
 @pytest.mark.parametrize(("count", "found"), [(CAPTIONS, CAPTIONS), (5, 0)])
 def test_only_what_rests_is_suspected_and_not_a_few_points(count, found):
     problem, scene = captioned("handheld", 0.05, count)
-    suspects = resting(problem.observations, problem.focal)
+    suspects = resting(problem.observations)
     assert (suspects[:scene].sum(), suspects[scene:].sum()) == (0, found)
 
 
 def test_nothing_rests_where_the_camera_does():
     problem, _ = captioned("static", 0.0)
-    assert not resting(problem.observations, problem.focal).any()
+    assert not resting(problem.observations).any()
 
 
 @pytest.mark.parametrize("parallax", [0.02, 0.05])
 def test_captions_do_not_bend_the_cameras(parallax):
     # With the captions, the best fit is 16 pixels off.
     problem, scene = captioned("handheld", parallax)
-    core, solved = converge_cameras(perturbed(problem.truth, structure=0.2), problem.observations, Options())
+    core, solved = start_cameras(perturbed(problem.truth, structure=0.2), problem.observations, Options())
     np.testing.assert_array_equal(core, np.arange(scene))
     error_px = problem.focal * angles_between(solved.state.rotation, problem.truth.rotation)
     assert 0.01 < error_px.max() < 0.3
@@ -64,7 +64,7 @@ def test_captions_do_not_bend_the_cameras(parallax):
 @pytest.mark.parametrize(("motion", "parallax"), [("truck", 0.05), ("dolly", 0.1)])
 def test_what_may_be_far_away_is_kept(motion, parallax):
     problem, _ = captioned(motion, parallax)
-    core, solved = converge_cameras(perturbed(problem.truth, structure=0.2), problem.observations, Options())
+    core, solved = start_cameras(perturbed(problem.truth, structure=0.2), problem.observations, Options())
     assert len(core) == len(problem.points)
     error_px = problem.focal * angles_between(solved.state.rotation, problem.truth.rotation)
     assert 0.01 < error_px.max() < 0.3

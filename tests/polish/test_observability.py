@@ -36,7 +36,7 @@ def classified(problem):
     start = perturbed(problem.truth, angle_rad=1e-3, shift=1e-3)
     adjustment = BundleAdjustment(start, problem.observations, OPTIONS, ErrorModel(problem.noise_px))
     adjustment.solve()
-    return classify_motion(adjustment, problem.observations, OPTIONS)
+    return classify_motion(adjustment, OPTIONS)
 
 
 def shot(motion, *, noise_px=0.1, seed=0, **kwargs):
@@ -52,18 +52,18 @@ def test_displacement_is_the_largest_median_over_the_frames():
     xy = np.zeros((9, 2))
     xy[frame == 1, 0] = [0.01, 0.02, 0.09]
     xy[frame == 2, 1] = [0.01, 0.015, 0.02]
-    assert displacement(Observations(frame, point, xy)) == pytest.approx(0.02)
+    assert displacement(Observations(frame, point, xy), xy) == pytest.approx(0.02)
 
 
 def test_displacement_counts_from_the_first_appearance():
     frame, point = np.array([0, 1, 1, 2]), np.array([0, 0, 1, 1])
     xy = np.array([[0.0, 0], [0.1, 0], [5.0, 5], [5.0, 5.1]])
-    assert displacement(Observations(frame, point, xy)) == pytest.approx(0.1)
+    assert displacement(Observations(frame, point, xy), xy) == pytest.approx(0.1)
 
 
 def test_displacement_of_a_rotation():
     problem = make_problem("rotation")
-    moved = displacement(problem.observations)
+    moved = displacement(problem.observations, problem.xy)
     assert moved == pytest.approx(np.radians(12), rel=0.1)
 
 
@@ -117,7 +117,7 @@ def test_outliers_do_not_make_a_tripod_move():
     problem = shot("static", points=200)
     o = problem.observations
     actor = o.point % 20 == 0
-    o.xy[actor, 0] += 0.01 * o.frame[actor]
+    o.pixels[actor, 0] += 0.01 * problem.focal * o.frame[actor]
     assert classified(problem).kind is ShotKind.STATIC
 
 
@@ -126,7 +126,7 @@ def test_the_adjustment_is_left_as_it_was():
     adjustment = BundleAdjustment(problem.truth, problem.observations, OPTIONS, ErrorModel(0.1))
     state = adjustment.solve()
     before = replace(state, rotation=state.rotation.copy(), translation=state.translation.copy())
-    classify_motion(adjustment, problem.observations, OPTIONS)
+    classify_motion(adjustment, OPTIONS)
     np.testing.assert_array_equal(adjustment.state.rotation, before.rotation)
     np.testing.assert_array_equal(adjustment.state.translation, before.translation)
 
@@ -135,7 +135,7 @@ def test_a_last_camera_that_has_lost_its_observations():
     problem = shot("truck")
     o = problem.observations
     kept = o.frame != problem.frames - 1
-    rest = replace(o, frame=o.frame[kept], point=o.point[kept], xy=o.xy[kept])
+    rest = replace(o, frame=o.frame[kept], point=o.point[kept], pixels=o.pixels[kept])
     adjustment = BundleAdjustment(problem.truth, rest, OPTIONS, ErrorModel(0.1))
     last = observed(adjustment)[-1]
     assert (len(observed(adjustment)), np.isnan(last.triangulation_angle_deg)) == (problem.frames, True)
@@ -201,8 +201,8 @@ def solutions(motion, noise_px=0.3):
     problem = make_problem(motion, frames=5, points=60, parallax=0.1)
     found = []
     for seed in range(TRIALS):
-        noise = np.random.default_rng([seed, 5]).standard_normal(problem.observations.xy.shape)
-        noisy = replace(problem.observations, xy=problem.observations.xy + noise_px / problem.focal * noise)
+        noise = np.random.default_rng([seed, 5]).standard_normal(problem.observations.pixels.shape)
+        noisy = replace(problem.observations, pixels=problem.observations.pixels + noise_px * noise)
         adjustment = BundleAdjustment(problem.truth, noisy, GAUSSIAN, ErrorModel(noise_px))
         state = adjustment.solve()
         unit = state.inverse_distance.mean() / problem.truth.inverse_distance.mean()

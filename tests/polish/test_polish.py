@@ -8,7 +8,7 @@ import pytest
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import ErrorModel
-from factorsfm.polish.camera_starts import converge_cameras, in_front
+from factorsfm.polish.camera_starts import in_front, start_cameras
 from factorsfm.polish.connected_frames import connected_frames
 from factorsfm.polish.polish import polish
 from factorsfm.polish.start import with_all_points
@@ -84,7 +84,7 @@ def test_the_tracks_outside_the_core_follow_the_cameras_in_whatever_unit():
     o, truth = problem.observations, problem.truth
     core = np.arange(0, len(truth.bearing), 2)
     short = (o.point % 2 == 1) & (o.frame >= 4)  # the others are seen later, and by fewer
-    seen = Observations(o.frame[~short], o.point[~short], o.xy[~short])
+    seen = Observations(o.frame[~short], o.point[~short], o.pixels[~short])
     unit = 0.01
     solved = replace(
         truth,
@@ -102,12 +102,12 @@ def test_a_solution_under_a_wide_kernel_is_solved_again():
     problem = make_problem("truck", frames=12, points=200, parallax=0.05, noise_px=0.05)
     rng = np.random.default_rng(3)
     seen = problem.observations
-    wrong = rng.random(len(seen.xy)) < 0.1  # single observations that are elsewhere
-    xy = seen.xy + wrong[:, None] * rng.normal(0.0, 5.0 / problem.focal, seen.xy.shape)
-    seen = replace(seen, xy=xy)
+    wrong = rng.random(len(seen.pixels)) < 0.1  # single observations that are elsewhere
+    pixels = seen.pixels + wrong[:, None] * rng.normal(0.0, 5.0, seen.pixels.shape)
+    seen = replace(seen, pixels=pixels)
     options = Options.preset_named("geometry")
-    _, best = converge_cameras(problem.truth, seen, options)
-    _, found = converge_cameras(bent(problem.truth), seen, options)
+    _, best = start_cameras(problem.truth, seen, options)
+    _, found = start_cameras(bent(problem.truth), seen, options)
     costs = [BundleAdjustment(b.state, seen, options.polish, ErrorModel(0.05)).cost() for b in (best, found)]
     assert costs[1] == pytest.approx(costs[0], rel=1e-4)
     assert found.sigma == pytest.approx(0.048, rel=0.05)

@@ -1,0 +1,72 @@
+"""The result of the polish."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
+from factorsfm.adjustment.observations import Observations
+from factorsfm.adjustment.prior_term import PriorPart
+from factorsfm.adjustment.state import State
+from factorsfm.control.fit import ControlFit
+from factorsfm.lens.lens import LensEstimate
+from factorsfm.lens.rolling_shutter import Shutter
+from factorsfm.motion.shot_kind import Motion
+from factorsfm.polish.observability import CameraObservability
+from factorsfm.support.similarity import Similarity
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+@dataclass(slots=True)
+class Polished:
+    """Result of the polish; the first of its cameras is the world, the median inverse distance is about 1.
+
+    Attributes:
+        frames: (k,) positions of the images in `state`; tracks: (n,) track of each point.
+        errors: (m,) reprojection errors of `observations` (pixels); sigma: their standard deviation.
+        covariance: (k, 6, 6) of the poses, GTSAM's convention, `in_scene_unit`.
+        observability: of the pose of each camera.
+        point_std: (n,) standard deviations of the inverse distances, in the same unit.
+        left_out: why, of the registered images that have no pose here.
+        lens: the estimate of an unknown lens, None where it is known.
+        shutter: a rolling shutter, None where the shot shows none; recorded: whether poses are those of cameras without
+            one, fitted to the recorded images, see `Options.shutter`.
+        world_alignment: from this world to that of the control; control: its residuals. None without control.
+        control_unused: whether there is control that could not take part.
+    """
+
+    frames: list[int]
+    state: State
+    tracks: Index
+    observations: Observations
+    errors: Array
+    sigma: float
+    motion: Motion
+    covariance: Array
+    observability: list[CameraObservability]
+    point_std: Array
+    left_out: dict[int, str]
+    prior: PriorPart | None = None
+    lens: LensEstimate | None = None
+    shutter: Shutter | None = None
+    recorded: bool = False
+    world_alignment: Similarity | None = None
+    control: ControlFit | None = None
+    control_unused: bool = False
+
+    def describe_prior(self, adjustment: BundleAdjustment, camera_covariance: Array) -> None:
+        """Take over what a solution says of the prior: its residuals, and how certain its scales and shifts are.
+
+        Args:
+            camera_covariance: (c, c) of the camera side of the solution, `in_scene_unit`.
+        """
+        if self.prior is None:
+            return
+        std = np.sqrt(camera_covariance.diagonal())
+        self.prior.residual = adjustment.prior_residuals()
+        self.prior.scale_std, self.prior.shift_std = std[adjustment.columns.scales], std[adjustment.columns.shifts]

@@ -1,0 +1,101 @@
+"""What is polished: the images, their tracks, and the first guess of their lens."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorsfm.adjustment.gather import gather
+from factorsfm.adjustment.observations import Observations
+from factorsfm.camera.projection import without_distortion
+from factorsfm.lens.lens import Lens
+from factorsfm.lens.rolling_shutter import Recording, with_sweep
+from factorsfm.mapping.mapped_images import MappedImage
+from factorsfm.tracks.image_tracks import ImageTracks, seen_by
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """The images of a shot or a set, and what the incremental map says of them.
+
+    Attributes:
+        images: all of them, registered or not.
+        map_points: track ids and positions of the incremental map.
+        guess: of the lens; its shape is zero where the lens is not estimated.
+        group: (images,) which of its focal lengths is that of each image.
+        first_focal: see `estimate_lens`.
+        recording: of which the images are all, None if their rows were all read at once.
+    """
+
+    images: list[MappedImage]
+    map_points: tuple[Index, Array]
+    guess: Lens
+    group: Index
+    first_focal: tuple[Array, float] | None
+    recording: Recording | None
+
+    @classmethod
+    def of(
+        cls,
+        images: list[MappedImage],
+        map_points: tuple[Index, Array],
+        focal: Array,
+        distortion: Array | None,
+        groups: Index | None,
+        first_focal: tuple[Array, float] | None,
+        recording: Recording | None,
+    ) -> Shot:
+        """A shot whose lens is estimated where a distortion is given: its tracks keep their distorted pixels then."""
+        guess = Lens(focal)
+        if distortion is not None:
+            guess = Lens(focal, np.r_[distortion, np.zeros(2)])
+            images = [replace(image, tracks=_distorted(image.tracks)) for image in images]
+        group = np.zeros(len(images), np.int64) if groups is None else groups
+        return cls(images, map_points, guess, group, first_focal, recording)
+
+    @property
+    def registered(self) -> list[int]:
+        """Positions of the registered images."""
+        return [position for position, image in enumerate(self.images) if image.registered]
+
+    def tracks(self, frames: Sequence[int]) -> list[ImageTracks]:
+        """Those of some images."""
+        return [self.images[position].tracks for position in frames]
+
+    def long_tracks(self, frames: Sequence[int], least: int) -> Index:
+        """Ids (ascending) of the tracks that at least so many of the images see."""
+        return seen_by(self.tracks(frames), least)
+
+    def observations(self, frames: Sequence[int], tracks: Index) -> Observations:
+        """Of some tracks (ascending ids) in some images."""
+        return gather(self.tracks(frames), tracks, self._focal(frames))
+
+    def swept(self, observations: Observations, frames: Sequence[int], tracks: Index) -> Observations:
+        """The same with their motion during the readout, if the images have one."""
+        if self.recording is None:
+            return observations
+        return with_sweep(observations, tracks, self.images, frames, self._focal(frames), self.recording)
+
+    def marks(self, marks: Sequence[ImageTracks], frames: Sequence[int], points: int) -> Observations:
+        """Points that were marked in the images, as the tracks are observed.
+
+        Args:
+            marks: by image, in pixels of its camera; frames: rows of the observations; points: how many there are.
+        """
+        by_position = {mark.position: replace(mark, camera=self.images[mark.position].tracks.camera) for mark in marks}
+        none = self.images[0].tracks.of(np.zeros(0, np.int64))
+        seen = [by_position.get(position, none) for position in frames]
+        return gather(seen, np.arange(points), self._focal(frames))
+
+    def _focal(self, frames: Sequence[int]) -> Array:
+        return self.guess.focal[self.group[list(frames)]]
+
+
+def _distorted(tracks: ImageTracks) -> ImageTracks:
+    return replace(tracks, camera=without_distortion(tracks.camera))
