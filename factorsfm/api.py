@@ -77,34 +77,43 @@ def reconstruct(
         ReconstructionError: the shot cannot be reconstructed.
     """
     begin = time.perf_counter()
-    for name, value, known_values in (
-        ("lens", lens, get_args(LensFreedom)),
-        ("shutter", shutter, get_args(ShutterUse)),
-    ):
-        if value not in known_values:
-            raise InputError(f"unknown {name} '{value}', expected one of {', '.join(known_values)}")
+    _check_choice("lens", lens, get_args(LensFreedom))
+    _check_choice("shutter", shutter, get_args(ShutterUse))
     options = replace(Options.preset_named(preset), lens=lens, shutter=shutter)
     camera = open_camera(camera)
     frames = checked_range(frames) if frames is not None else None
     prior = open_depth(depth, depth_kind) if options.uses_depth else None
     mask_prior = open_masks(masks)
     known = read_control(control) if isinstance(control, str | Path) else control
-    if known is not None and isinstance(source, str | Path) and Path(source).is_dir():
-        names = [(index, path.name) for index, path in enumerate(list_images(Path(source)))]
-        find_frames(known, names[frames or slice(None)])  # before the long work
+    _check_control(known, source, frames)
     if unordered is None:
         unordered = isinstance(source, str | Path) and looks_unordered(Path(source), frames)
     if unordered:
         result = _from_images(source, frames, camera, prior, mask_prior, options, known, features, work, progress)
     else:
         result = _from_shot(source, frames, camera, prior, mask_prior, options, known, progress)
+    said = {
+        "source": str(source) if isinstance(source, str | Path) else "frames",
+        "unordered": unordered,
+        "features": str(features),
+        **input_options(prior, mask_prior, frames),
+    }
     for part in (result, *result.others):
         part.seconds["total"] = time.perf_counter() - begin
-        part.options["source"] = str(source) if isinstance(source, str | Path) else "frames"
-        part.options["unordered"] = unordered
-        part.options["features"] = str(features)
-        part.options |= input_options(prior, mask_prior, frames)
+        part.options |= said
     return result
+
+
+def _check_choice(name: str, value: str, expected: tuple[str, ...]) -> None:
+    if value not in expected:
+        raise InputError(f"unknown {name} '{value}', expected one of {', '.join(expected)}")
+
+
+def _check_control(control: Control | None, source: object, frames: slice | None) -> None:
+    """Before the long work: a folder has all frames that the control names."""
+    if control is not None and isinstance(source, str | Path) and Path(source).is_dir():
+        names = [(index, path.name) for index, path in enumerate(list_images(Path(source)))]
+        find_frames(control, names[frames or slice(None)])
 
 
 def input_options(depth: DepthPrior | None, masks: MaskPrior | None, frames: slice | None) -> dict[str, Any]:

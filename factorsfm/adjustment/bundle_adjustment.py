@@ -8,7 +8,6 @@ prior. Points are unit bearings with an inverse distance, in which small motion 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -30,15 +29,8 @@ from factorsfm.support.rotations import exponential
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-# The camera side's step at a state, from its information matrix and gradient with the points eliminated.
-CameraSolver = Callable[[State, Array, Array], Array]
-
 _FIRST_DAMPING = 1e-4
 _LARGEST_DAMPING = 1e6
-
-
-def _newton_step(state: State, information: Array, gradient: Array) -> Array:
-    return -solution(information, gradient)
 
 
 class BundleAdjustment:
@@ -181,13 +173,11 @@ class BundleAdjustment:
         information, gradient, _ = reduced(normal, self._elimination.cross_blocks(normal), 0.0)
         return conditioned(information[np.ix_(self._free, self._free)]), gradient[self._free]
 
-    def _step(
-        self, normal: Normal, blocks: list[Block], damping: float, solve_cameras: CameraSolver
-    ) -> tuple[Array, Array]:
+    def _step(self, normal: Normal, blocks: list[Block], damping: float) -> tuple[Array, Array]:
         information, gradient, point_covariance = reduced(normal, blocks, damping)
         free = self._free
         camera = np.zeros(self.columns.size)
-        camera[free] = solve_cameras(self.state, conditioned(information[np.ix_(free, free)]), gradient[free])
+        camera[free] = -solution(conditioned(information[np.ix_(free, free)]), gradient[free])
         pull = normal.point_gradient.copy()
         for cross, columns, span in blocks:
             pull[span] += (camera[columns] @ cross).reshape(-1, 3)
@@ -222,12 +212,11 @@ class BundleAdjustment:
             world=s.world,
         )
 
-    def solve(self, iterations: int | None = None, solve_cameras: CameraSolver = _newton_step) -> State:
+    def solve(self, iterations: int | None = None) -> State:
         """Minimise; the result is also `self.state`.
 
         Args:
             iterations: at most; those of the options by default.
-            solve_cameras: see `CameraSolver`.
         """
         damping = _FIRST_DAMPING
         cost = self.cost()
@@ -235,7 +224,7 @@ class BundleAdjustment:
             normal = self._linearize()
             blocks = self._elimination.cross_blocks(normal) if len(self._free) else []
             while damping < _LARGEST_DAMPING:
-                candidate = self._retract(*self._step(normal, blocks, damping, solve_cameras))
+                candidate = self._retract(*self._step(normal, blocks, damping))
                 new_cost = self._cost(candidate)
                 if new_cost < cost:
                     break
