@@ -16,6 +16,7 @@ from factorsfm.frames.frame import Frame, bgr_image
 from factorsfm.frames.reading import read_frames
 from factorsfm.frames.texture import BLANK_TEXTURE, image_texture
 from factorsfm.support.errors import InputError
+from factorsfm.support.json_text import as_text
 
 logger = logging.getLogger(__name__)
 
@@ -75,11 +76,13 @@ def read_images(
 
 
 def other_files(source: Path) -> list[str]:
-    """Names of the files of a folder that are not images, without hidden files."""
+    """Names of the files of a folder that are not images, without hidden files, as UTF-8 can hold them."""
     if not source.is_dir():
         return []
     images = set(list_images(source))
-    return sorted(p.name for p in source.iterdir() if p.is_file() and p not in images and not p.name.startswith("."))
+    return sorted(
+        as_text(p.name) for p in source.iterdir() if p.is_file() and p not in images and not p.name.startswith(".")
+    )
 
 
 def looks_unordered(source: Path, frames: slice | None = None) -> bool:
