@@ -1,4 +1,4 @@
-"""What has become of all shots: index.json, and index.html as the page to begin with."""
+"""The index of a batch: index.json for programs, and index.html with links to all reports."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ class Entry:
     """A shot that is done.
 
     Attributes:
-        video, shot: file name, and number in the video from 1.
-        folder: of the result, below the output.
-        frames: first frame, and the one after the last.
-        verdict: what has been recovered, or why nothing.
-        parallax: NaN where there is none.
-        seconds: of computing.
-        thumbnail: a small JPEG, if there is a picture.
+        video, shot: file name, and number of the shot in the video, from 1.
+        folder: of the result, relative to the output.
+        frames: first frame, and last frame + 1.
+        verdict: the result in one sentence, or the reason of the failure.
+        parallax: NaN if unknown.
+        seconds: computing time.
+        thumbnail: a small JPEG, or None.
     """
 
     video: str
@@ -71,12 +71,12 @@ class Entry:
 
 
 class Index:
-    """The two files, written anew whenever a shot is done.
+    """The two files, written again after every shot.
 
     Args:
-        source, output: of the whole.
-        shots: of all videos that could be read; unread: of the others, why not.
-        jobs: all of them, in the order of the page.
+        source, output: of the batch.
+        shots: of the videos that could be read; unread: the reasons of the others.
+        jobs: in the order of the page.
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class Index:
         return [self._entries[job.folder] for job in self._jobs if job.folder in self._entries]
 
     def add(self, job: Job) -> None:
-        """Take a job that is done."""
+        """Add a job that is done."""
         self._entries[job.folder] = Entry.of(job, self._output)
 
     def write(self) -> None:
@@ -163,7 +163,7 @@ class Index:
 
 @dataclass(frozen=True, slots=True)
 class _EarlierVideo:
-    """A video in index.json, see `Video.to_dict`, and the first frame of each shot and the one after its last."""
+    """A video in index.json, see `Video.to_dict`; each shot is its first frame and its last frame + 1."""
 
     video: str
     size: int
@@ -176,7 +176,7 @@ class _EarlierVideo:
 
 @dataclass(frozen=True, slots=True)
 class _Earlier:
-    """What index.json says of the run that has written it."""
+    """The part of index.json that a later run reads."""
 
     program: str
     version: str
@@ -185,10 +185,10 @@ class _Earlier:
 
 
 def shots_known(output: Path, source: Path) -> dict[str, list[range]]:
-    """Shots that an earlier run has found, by the JSON text of `Video.to_dict`; empty if another version did.
+    """The shots from an earlier run, by the JSON text of `Video.to_dict`; empty if another version found them.
 
     Raises:
-        InputError: the folder cannot be written, or holds something else than an earlier run on this source.
+        InputError: the folder cannot be written, or it holds something else than an earlier run on this source.
     """
     path = output / "index.json"
     if not path.exists():

@@ -1,4 +1,4 @@
-"""What a batch reads back of its results: the summaries, and a picture of each report."""
+"""The outcome of a shot, read from its result folder."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _DATA = re.compile(r'<script type="application/json" id="data">(.*?)</script>', 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What the summary of a shot says: `verdict` where it is reconstructed, else `reason`."""
+    """The summary of a shot, with `verdict` if it is reconstructed and `reason` otherwise."""
 
     reconstructed: bool
     frames: int
@@ -37,16 +37,16 @@ class Outcome:
 
 
 def read_outcome(folder: Path) -> Outcome:
-    """What has become of the shot with this result folder.
+    """Read the summary of a result folder.
 
     Raises:
-        InputError: there is no summary, or a damaged one.
+        InputError: there is no summary, or it is damaged.
     """
     return typed(Outcome, read_json(folder / "summary.json", "the summary"), "summary.json")
 
 
 def is_result_of(job: dict[str, Any], folder: Path) -> bool:
-    """Whether a folder holds the whole result of a job, which `Job.to_dict` describes."""
+    """Whether a folder holds the complete result of the job with this description, see `Job.to_dict`."""
     try:
         return read_outcome(folder).options.get("job") == job and (folder / "report.html").is_file()
     except InputError:
@@ -54,12 +54,12 @@ def is_result_of(job: dict[str, Any], folder: Path) -> bool:
 
 
 def thumbnail(report: Path) -> bytes | None:
-    """The picture in the middle of a report as a smaller JPEG; None where there is none."""
+    """The middle picture of a report as a small JPEG, or None."""
     try:
         match = _DATA.search(report.read_text(encoding="utf-8"))
         pictures = [text for text in json.loads(match[1])["thumbnail"] if text] if match else []
         data = base64.b64decode(pictures[len(pictures) // 2]) if pictures else b""
-    except (OSError, ValueError, LookupError, TypeError):  # a damaged report costs its picture
+    except (OSError, ValueError, LookupError, TypeError):  # the report is missing or damaged
         return None
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
     if image is None:

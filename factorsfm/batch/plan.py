@@ -1,4 +1,4 @@
-"""What there is to do: the videos, their shots, and one job for each of these."""
+"""The plan of a batch: the videos, their shots, and one job per shot."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from factorsfm.support.options import LensFreedom, ShutterUse
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """What shots are reconstructed with; see `factorsfm.reconstruct`, files and folders as absolute paths."""
+    """The arguments of `factorsfm.reconstruct` for all shots, with absolute paths."""
 
     camera: pycolmap.Camera | None = None
     depth: str | None = None
@@ -35,7 +35,7 @@ class Method:
     shutter: ShutterUse = "auto"
 
     def of_video(self, name: str) -> Method:
-        """With what belongs to this video of several: folders of its name in those of maps and masks."""
+        """For one of several videos: with the folders of its maps and masks."""
         depth, masks = self.depth, self.masks
         if depth is not None and Path(depth).is_dir():
             depth = str(Path(depth) / name)
@@ -44,7 +44,7 @@ class Method:
         return replace(self, depth=depth, masks=masks)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data, as written beside every result."""
+        """Plain data."""
         return {
             "camera": self.camera and camera_to_json(self.camera),
             "depth": self.depth,
@@ -58,12 +58,12 @@ class Method:
 
 @dataclass(frozen=True, slots=True)
 class Video:
-    """A video file as it is now.
+    """A video file.
 
     Attributes:
         path: absolute.
         name: of its folder in the output.
-        size, modified_ns: of the file, by which it is known again.
+        size, modified_ns: of the file; a later run takes a file with other values for a new video.
     """
 
     path: Path
@@ -90,7 +90,7 @@ class Job:
     folder: Path
 
     def to_dict(self) -> dict[str, Any]:
-        """What the result depends on, as written beside it."""
+        """Everything that the result depends on; its summary holds this."""
         frames = f"{self.frames.start}:{self.frames.stop}"
         content: dict[str, Any] = json.loads(
             json_text({**self.video.to_dict(), "frames": frames, **self.method.to_dict()})
@@ -98,15 +98,15 @@ class Job:
         return content
 
     def is_done(self) -> bool:
-        """Whether the folder holds the result of this very job."""
+        """Whether the folder holds the complete result of this job."""
         return is_result_of(self.to_dict(), self.folder)
 
 
 def find_videos(source: Path) -> list[Video]:
-    """The video file, or those of a folder in natural order.
+    """The video file, or the video files of a folder in natural order.
 
     Raises:
-        InputError: there is none.
+        InputError: there is no video.
     """
     if source.is_dir():
         paths = list_files(source, VIDEO_SUFFIXES)
@@ -126,10 +126,10 @@ def find_videos(source: Path) -> list[Video]:
 
 
 def shots_of(video: Video) -> list[range]:
-    """Its shots.
+    """The shots of a video.
 
     Raises:
-        InputError: the video cannot be read, or shows nothing.
+        InputError: the video cannot be read, or all of its frames are blank.
     """
     shots = find_shots(video.path)
     if not shots:
@@ -138,13 +138,13 @@ def shots_of(video: Video) -> list[range]:
 
 
 def plan_jobs(shots: Mapping[Video, Sequence[range]], method: Method, output: Path, *, several: bool) -> list[Job]:
-    """A job for every shot.
+    """One job per shot.
 
     Args:
-        several: whether maps and masks are in folders with the names of the videos.
+        several: whether maps and masks lie in one folder per video, with the name of the video.
 
     Raises:
-        InputError: masks are given, and none belongs to any frame.
+        InputError: no mask belongs to any frame.
     """
     jobs = []
     matched = False
@@ -152,7 +152,7 @@ def plan_jobs(shots: Mapping[Video, Sequence[range]], method: Method, output: Pa
         own = method.of_video(video.name) if several else method
         masks = MaskFolder(own.masks) if own.masks is not None and Path(own.masks).is_dir() else None
         for number, frames in enumerate(ranges, 1):
-            # Of a film, often only the shots with actors have masks.
+            # A shot without any mask is reconstructed without: often only shots with actors have masks.
             masked = masks is None or any(map(masks.has, frames))
             matched |= own.masks is not None and masked
             chosen = own if masked else replace(own, masks=None)

@@ -1,4 +1,4 @@
-"""What a worker does with a job: the same as ``factorsfm reconstruct``, and the result or the failure on disk."""
+"""The work of a batch: find the shots of a video; reconstruct a shot and write its result folder."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ def find_shots_of(video: Video, *, one_thread: bool) -> list[range]:
 
 
 def reconstruct_shot(job: Job, *, one_thread: bool, progress: Progress | None = None) -> None:
-    """Write the result of a shot, or why there is none.
+    """Reconstruct a shot and write its result folder, also if it fails.
 
     Args:
-        one_thread: keep to one thread, where there is no more than a core for each worker.
+        one_thread: use one thread, because each worker has only one core.
 
     Raises:
         InputError: the folder cannot be written.
@@ -31,7 +31,7 @@ def reconstruct_shot(job: Job, *, one_thread: bool, progress: Progress | None = 
     begin = time.perf_counter()
     method = job.method
     try:
-        # A network opened inside keeps to one thread, too, see `priors.networks`.
+        # A network that is opened inside uses one thread, too, see `priors.networks`.
         with OneThreadEach() if one_thread else nullcontext():
             reconstruction = api.reconstruct(
                 job.video.path,

@@ -1,5 +1,4 @@
-"""The command line: one module a command.
+"""The command line: one module per command.
 
-Takes arguments, gives files and sentences; it reads arguments and calls the Python interface. No algorithm. May import
-every room below: it is the top.
+Takes arguments, gives files and sentences. It calls the Python interface and holds no algorithm. May import every room.
 """

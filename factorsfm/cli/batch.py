@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
-    """Reconstruct every shot, or go on where an earlier run has stopped; see `Command.run`."""
+    """Reconstruct every shot that an earlier run has not done; see `Command.run`."""
     show = progress.show
     if arguments.workers and arguments.scheduler:
         raise InputError("--workers and --scheduler cannot be combined: a cluster has its own workers")
@@ -77,15 +77,15 @@ def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
 
 
 def _one_thread(workers: int, scheduler: str | None) -> bool:
-    """Whether each worker keeps to one thread: where it has no more than a core, others would only wait for it.
+    """Whether each worker uses one thread, because it has only one core.
 
-    How many share a machine of a cluster is not known here.
+    On a cluster the number of cores per worker is unknown, so each uses one.
     """
     return scheduler is not None or len(available_cores()) < 2 * workers
 
 
 def _method(arguments: argparse.Namespace, *, several: bool) -> Method:
-    """What was asked for, opened once so that a mistake is found before the work."""
+    """The arguments for all shots; opens camera, prior and masks once, to find errors before the work."""
     depth, masks = _absolute(arguments.depth), _absolute(arguments.masks)
     if Options.preset_named(arguments.preset).uses_depth and not (several and depth and Path(depth).is_dir()):
         open_depth(depth, arguments.depth_kind)
@@ -96,7 +96,7 @@ def _method(arguments: argparse.Namespace, *, several: bool) -> Method:
 
 
 def _absolute(text: str | None) -> str | None:
-    """Workers may have another working directory; the word "none" is no value."""
+    """An absolute path, since workers may have another working directory; None for "none"."""
     if text is None or text == "none":
         return None
     return str(Path(text).resolve()) if Path(text).exists() else text
@@ -105,7 +105,7 @@ def _absolute(text: str | None) -> str | None:
 def _find_shots(
     crew: Crew, videos: Sequence[Video], known: dict[str, list[range]], *, one_thread: bool, show: Show
 ) -> tuple[dict[Video, list[range]], dict[Video, str]]:
-    """Shots of the videos that can be read, and of the others why not.
+    """The shots of the videos that can be read, and the reasons of the others.
 
     Raises:
         InputError: no video can be read.
@@ -126,13 +126,13 @@ def _find_shots(
 
 
 def _reconstruct(crew: Crew, work: Callable[[Job], None], jobs: Sequence[Job], index: Index, show: Show) -> None:
-    """Do the jobs, the longest first, so that all workers end at about the same time."""
+    """Do the jobs, longest first, so that all workers end at about the same time."""
     line = _Line(show, len(index.entries), jobs)
     for job, outcome in crew.run(work, sorted(jobs, key=lambda job: -len(job.frames))):
         if isinstance(outcome, BaseException):
             logger.info("%s failed", job.folder, exc_info=outcome)
             said = str(outcome) if isinstance(outcome, FactorsfmError) else f"{type(outcome).__name__}: {outcome}"
-            # Without the job beside it, so that the next run tries again.
+            # The summary does not name the job, so the next run tries again.
             write_failure(job.folder, said, options={"source": str(job.video.path)})
         index.add(job)
         index.write()
@@ -140,9 +140,9 @@ def _reconstruct(crew: Crew, work: Callable[[Job], None], jobs: Sequence[Job], i
 
 
 def _remove_others(output: Path, jobs: Sequence[Job], unread: Collection[Video]) -> None:
-    """Remove results that an earlier run left and that are none of these jobs: of a video that had more shots.
+    """Remove results of an earlier run that belong to no job, from videos that had more shots.
 
-    Those of a video that cannot be read now stay.
+    Results of videos that cannot be read now stay.
     """
     kept = {job.folder for job in jobs}
     unreadable = {video.name for video in unread}
@@ -153,7 +153,7 @@ def _remove_others(output: Path, jobs: Sequence[Job], unread: Collection[Video])
 
 
 class _Line:
-    """How far it is, and how long it will take."""
+    """The line of progress: shots done, and time left."""
 
     def __init__(self, show: Show, done: int, waiting: Sequence[Job]) -> None:
         self._show, self._shots, self._done = show, done + len(waiting), done

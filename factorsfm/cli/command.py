@@ -1,4 +1,4 @@
-"""What every command of the command line consists of, and the arguments that several of them take."""
+"""The parts of a command, and the arguments that several commands share."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ class Command:
     """A command.
 
     Attributes:
-        help: in the list of commands; description: in its own help.
-        add_arguments: declares what it takes.
-        run: does it, and returns sentences for the user. Raises InputError where the input cannot be used, and
-            ReconstructionError where a shot cannot be reconstructed.
-        followed: whether warnings are shown at once, since somebody follows what it does.
+        help: for the list of commands; description: for the command's own help.
+        add_arguments: declares the arguments.
+        run: runs the command and returns sentences for the user. Raises InputError if the input cannot be used, and
+            ReconstructionError if the shot cannot be reconstructed.
+        followed: whether warnings are printed at once, because the user watches the command.
     """
 
     name: str
@@ -42,12 +42,12 @@ class Command:
 
 
 def add_output(parser: argparse.ArgumentParser, help_: str = RESULT_FOLDER) -> None:
-    """Declare where the result goes."""
+    """Declare the output folder."""
     parser.add_argument("--output", type=Path, required=True, metavar="DIR", help=help_)
 
 
 def add_method(parser: argparse.ArgumentParser) -> None:
-    """Declare with what a shot is reconstructed."""
+    """Declare lens, prior, masks and preset."""
     parser.add_argument(
         "--camera", type=Path, metavar="FILE.json", help="width, height, fx, fy, cx, cy; default: estimated"
     )
@@ -87,38 +87,38 @@ def add_method(parser: argparse.ArgumentParser) -> None:
 
 
 def add_range(parser: argparse.ArgumentParser) -> None:
-    """Declare which frames are read."""
+    """Declare the range of frames."""
     parser.add_argument("--frames", metavar="START:STOP[:STEP]", help="counted from 0, without STOP")
 
 
 def range_of(arguments: argparse.Namespace) -> slice | None:
-    """The frames to read; None is all of them.
+    """The range of frames, None for all.
 
     Raises:
-        InputError: the range is none.
+        InputError: it is not a range.
     """
     return parse_range(arguments.frames) if arguments.frames is not None else None
 
 
 def unless_none(text: str | None) -> str | None:
-    """The word "none" is no value."""
+    """None for the word "none", else the text."""
     return None if text == "none" else text
 
 
 def as_given(arguments: argparse.Namespace) -> dict[str, Any]:
-    """What is written beside the reason of a failure."""
+    """The arguments as options of a failed result."""
     return {name: value for name, value in vars(arguments).items() if name not in ("command", "output", "verbose")}
 
 
 def write_result(reconstruction: Reconstruction, output: Path, progress: Progress) -> str:
-    """Write the result folder; what to say of it."""
+    """Write the result folder, and return the sentences for the user."""
     progress("writing", 0, None)
     write_folder(reconstruction, output)
     return conclusion(reconstruction, output)
 
 
 def count_of(what: str) -> Callable[[str], int]:
-    """The type of an argument that is a number of something, 1 or more."""
+    """The argparse type of a number from 1; the message names what is counted."""
 
     def count(text: str) -> int:
         if not re.fullmatch(r"0*[1-9]\d{0,8}", text, re.ASCII):

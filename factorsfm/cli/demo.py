@@ -27,7 +27,7 @@ from factorsfm.synthetic import render_shot, write_shot
 
 @dataclass(frozen=True, slots=True)
 class DemoResult:
-    """A reconstruction beside the truth.
+    """A reconstruction compared with the truth.
 
     Attributes:
         reconstruction: of the rendered shot.
@@ -50,11 +50,10 @@ class DemoResult:
 
 
 def run_demo(directory: str | Path, progress: Progress | None = None) -> DemoResult:
-    """Render, reconstruct and compare; writes the result folder and picture.png into it.
+    """Render, reconstruct and compare; write the result folder, with a picture.png.
 
     Args:
-        directory: of the result: new, empty, or holding an earlier result, which is replaced.
-        progress: called with stage, done and total.
+        directory: of the result: new, empty, or with an earlier result, which is replaced.
 
     Raises:
         InputError: the directory cannot be written.
@@ -78,7 +77,7 @@ def run_demo(directory: str | Path, progress: Progress | None = None) -> DemoRes
     estimate = pose_arrays([frame.cam_from_world for frame in reconstruction.frames])
     errors = trajectory_errors(*estimate, *truth)
     path_length = float(np.linalg.norm(np.diff(truth[1], axis=0), axis=1).sum())
-    reconstruction.options["source"] = "rendered shot"  # its file is gone
+    reconstruction.options["source"] = "rendered shot"  # the file was temporary
     write_folder(reconstruction, directory)
     with complete_file(Path(directory) / "picture.png") as file:
         write_image(file, draw_picture(reconstruction))

@@ -1,4 +1,4 @@
-"""Ctrl-C in a stream: the first one ends the frames, and the result is written."""
+"""Ctrl-C in a stream: the first one ends the input, and the result is written."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from factorsfm.frames.frame import Frame
 
 
 class Interrupt:
-    """The first Ctrl-C ends the frames, never in the middle of one; a second one ends everything."""
+    """The first Ctrl-C ends the input after the current frame; the second one ends the program."""
 
     def __init__(self) -> None:
         self._asked = False
@@ -24,7 +24,7 @@ class Interrupt:
             raise KeyboardInterrupt
 
     def until(self, frames: Iterator[Frame]) -> Iterator[Frame]:
-        """The frames that come before the interrupt."""
+        """The frames before the interrupt."""
         while not self._asked:
             try:
                 self._waiting = True
@@ -39,7 +39,7 @@ class Interrupt:
 
 @contextmanager
 def first_interrupt() -> Iterator[Interrupt]:
-    """Takes Ctrl-C for as long as its context lasts."""
+    """Handles Ctrl-C within its context."""
     interrupt = Interrupt()
     before = signal.signal(signal.SIGINT, interrupt)
     try:

@@ -1,4 +1,4 @@
-"""The command line: finds the command, runs it, and says what came of it."""
+"""The command line: parses the arguments, runs the command, and prints its outcome."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ BAD_INPUT, NOT_RECONSTRUCTED, INTERRUPTED = 2, 3, 130
 _COMMANDS = {
     module.COMMAND.name: module.COMMAND for module in (reconstruct, stream, batch, extend, demo, export, overlay)
 }
-_LOGGED = 1000  # log lines that wait
+_LOGGED = 1000  # log lines that wait for the end
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -48,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _complain(f"error: {error}", BAD_INPUT)
     except KeyboardInterrupt:
         return _complain("interrupted", INTERRUPTED)
-    except (OSError, MemoryError) as error:  # of the machine, not of the program
+    except (OSError, MemoryError) as error:  # from the machine; not an error of the program
         logger.debug("", exc_info=True)
         log.buffer.clear()
         return _complain(f"error: {str(error) or 'not enough memory'}", BAD_INPUT)
@@ -58,7 +58,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _start_log(progress: ProgressLine, verbose: int, *, at_once: bool) -> MemoryHandler:
-    """Let what is logged go to stderr, at once or when it is flushed: bad input is one line, without its warnings."""
+    """Log to stderr, at once or at the end; the end can drop the warnings, so that bad input is one line."""
     level = (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
     log = MemoryHandler(_LOGGED, logging.DEBUG if at_once else logging.CRITICAL, LogHandler(progress))
     logging.basicConfig(level=level, handlers=[log])
@@ -75,7 +75,7 @@ def _complain(message: str, status: int) -> int:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Complains in one line, like every other error of the command line."""
+    """Prints errors in one line, like all errors of the command line."""
 
     def error(self, message: str) -> NoReturn:
         sys.exit(_complain(f"error: {message} (see {self.prog} --help)", BAD_INPUT))
@@ -97,7 +97,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"factorsfm {program_version()}")
     verbose: dict[str, Any] = {"action": "count", "help": "log what happens; twice: in every detail"}
     parser.add_argument("-v", "--verbose", default=0, **verbose)
-    common = _Parser(add_help=False)  # without a default: it would overwrite what stands before the command
+    common = _Parser(add_help=False)  # no default: it would overwrite a -v before the command
     common.add_argument("-v", "--verbose", default=argparse.SUPPRESS, **verbose)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for command in _COMMANDS.values():

@@ -1,4 +1,4 @@
-"""``factorsfm overlay``: the footage with what is locked into the scene."""
+"""``factorsfm overlay``: the footage with objects that are locked into the scene."""
 
 from __future__ import annotations
 

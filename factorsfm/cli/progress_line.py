@@ -1,4 +1,4 @@
-"""The line of progress on a terminal, and the log beside it."""
+"""The line of progress on a terminal, and log lines above it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from factorsfm.support.context import Closing
 
 
 class ProgressLine(Closing):
-    """One line on a terminal, rewritten; nothing where it is not enabled. It can be called as a `Progress`."""
+    """A `Progress` that rewrites one line on a terminal; does nothing if it is not enabled."""
 
     _SECONDS_BETWEEN = 0.1
 
@@ -28,7 +28,7 @@ class ProgressLine(Closing):
         self._stage = stage
 
     def show(self, text: str, at_once: bool = False) -> None:
-        """Replace the line; a text that comes too soon after another one is left out."""
+        """Replace the line; texts in quick succession are skipped."""
         now = time.monotonic()
         if not self._enabled or (not at_once and now < self._written + self._SECONDS_BETWEEN):
             return
@@ -49,7 +49,7 @@ class ProgressLine(Closing):
 
 
 class LogHandler(logging.StreamHandler[TextIO]):
-    """Writes log lines to stderr, in place of the line of progress."""
+    """Writes log lines to stderr; the line of progress gives way."""
 
     def __init__(self, line: ProgressLine) -> None:
         super().__init__()

@@ -56,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
-    """Write the result, or the reason why there is none; see `Command.run`."""
+    """Write the result, or the reason of the failure; see `Command.run`."""
     check_directory(arguments.output)
     camera, frames = open_camera(arguments.camera), range_of(arguments)
     begin = time.perf_counter()

@@ -36,7 +36,7 @@ from factorsfm.viewer.viewer import open_viewer
 logger = logging.getLogger(__name__)
 
 _SNAPSHOT_EVERY = 100  # frames
-_SPEED_FRAMES = 48  # over which the speed is averaged
+_SPEED_FRAMES = 48  # for the mean speed
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -119,7 +119,7 @@ def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _Inputs:
-    """What a stream is given besides its frames."""
+    """The arguments of a stream, opened."""
 
     camera: pycolmap.Camera | None
     depth: DepthPrior | None
@@ -154,7 +154,7 @@ def _open_source(arguments: argparse.Namespace, given: _Inputs) -> Source:
 
 
 def _begin(given: _Inputs, results: StreamResults, *, cuts: bool) -> Stream | Episode:
-    """What takes the frames, opened when there is a first one."""
+    """A stream, or an episode if the source is cut into shots."""
     if cuts:
         return Episode(
             given.camera,
@@ -167,14 +167,14 @@ def _begin(given: _Inputs, results: StreamResults, *, cuts: bool) -> Stream | Ep
 
 
 class _Line:
-    """The state in one line."""
+    """The line of progress: speed, latency and status."""
 
     def __init__(self, show: Callable[[str], None], source: Source, shots: bool) -> None:
         self._show, self._source, self._shots = show, source, shots
         self._times = deque([time.monotonic()], maxlen=_SPEED_FRAMES + 1)
 
     def timed(self, target: Stream | Episode, frame: Frame) -> FrameUpdate:
-        """Push a frame, and tell how long that took and what came of it."""
+        """Push a frame, and show the line."""
         begin = time.monotonic()
         update = target.push(frame)
         self._times.append(time.monotonic())
@@ -191,7 +191,7 @@ class _Line:
 
 
 def _check(arguments: argparse.Namespace) -> None:
-    """What contradicts itself, before anything is opened."""
+    """Check the arguments before anything is opened."""
     if arguments.snapshot_every and not arguments.snapshot:
         raise InputError("--snapshot-every needs --snapshot FILE")
     if arguments.cuts and (arguments.snapshot or arguments.resume):
@@ -204,7 +204,7 @@ def _check(arguments: argparse.Namespace) -> None:
 
 
 def _resumed(arguments: argparse.Namespace, given: _Inputs) -> Stream:
-    """The stream of a snapshot, which must have been made in the same way."""
+    """The stream of a snapshot, which must have the same preset and camera."""
     with ExitStack() as unless_the_same:
         stream = unless_the_same.enter_context(Stream.load(arguments.resume, depth=given.depth, masks=given.masks))
         if stream.options.preset != arguments.preset:
@@ -219,7 +219,7 @@ def _resumed(arguments: argparse.Namespace, given: _Inputs) -> Stream:
 
 
 def _after(source: Source, stream: Stream | None, name: str) -> Iterator[Frame]:
-    """The frames that a stream does not have yet; those of a live source, counted from 0 again, go on."""
+    """The frames that a resumed stream does not have yet; a live source starts at 0 and is renumbered."""
     if stream is None or not stream.frames:
         yield from source
         return
@@ -234,7 +234,7 @@ def _after(source: Source, stream: Stream | None, name: str) -> Iterator[Frame]:
 
 
 def _save(stream: Stream, path: Path) -> None:
-    """What cannot be saved, now that the stream runs, must not end it."""
+    """Save a snapshot; an error is logged and does not end the stream."""
     try:
         stream.save(path)
     except InputError as error:

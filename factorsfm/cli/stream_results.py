@@ -1,4 +1,4 @@
-"""What ``factorsfm stream`` writes: the result of a shot, or those of the shots of a film."""
+"""The results of ``factorsfm stream``: of one shot, or of every shot of a film."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from factorsfm.viewer.viewer import Viewer
 
 
 class StreamResults:
-    """Writes what has come of the frames.
+    """Writes the results.
 
     Args:
-        begin: when the command began, by `time.perf_counter`.
-        inputs: what is written beside the options of a result, see `api.input_options`.
+        begin: `time.perf_counter` at the start of the command.
+        inputs: further options of the results, see `api.input_options`.
     """
 
     def __init__(self, arguments: argparse.Namespace, source: Source, begin: float, inputs: Mapping[str, Any]) -> None:
@@ -33,14 +33,14 @@ class StreamResults:
         self._output: Path = arguments.output
         self._source = source
         self._begin = begin
-        self._said: list[str] = []  # of the shots of a film
-        self._reconstructed = 0  # of these
+        self._said: list[str] = []  # sentences on the shots
+        self._reconstructed = 0  # number of shots
         self._given = as_given(arguments)
         if "://" in arguments.source:  # it may hold a password
             self._given["source"] = source.name
 
     def write(self, stream: Stream, viewer: Viewer, progress: Progress) -> str:
-        """Finish a stream and write its result, or the reason why there is none; what to say of it."""
+        """Finish a stream, write its result or the reason of the failure, and return the sentences for the user."""
         try:
             reconstruction = stream.finish(progress)
         except ReconstructionError as error:
@@ -50,7 +50,7 @@ class StreamResults:
         return write_result(self._completed(reconstruction), self._output, progress)
 
     def write_shot(self, shot: ShotResult) -> None:
-        """Write what has become of the next shot of a film."""
+        """Write the result of the next shot of a film."""
         folder = self._output / f"shot-{len(self._said) + 1:03d}"
         if shot.reconstruction is None:
             write_failure(folder, shot.reason, shot.frames, self._given, self._seconds())
@@ -61,7 +61,7 @@ class StreamResults:
         self._said.append(f"{folder.name}, frames {shot.first} to {shot.last}: {said}.")
 
     def conclude(self) -> str:
-        """What to say of the shots of a film, all of which have been written."""
+        """The sentences for the user, after all shots of a film."""
         if not self._reconstructed:
             raise ReconstructionError(f"none of {len(self._said)} shots could be reconstructed; {self._said[0]}")
         return "\n".join([*self._said, f"Results in {self._output}"])

@@ -1,6 +1,6 @@
-"""Files for other tools: by name through `export`, or one by one.
+"""Files for other tools: by format name through `export`, or through the writer of a format.
 
-Takes a `Reconstruction`, gives files. May import `result` and what lies below it.
+Takes a `Reconstruction`, gives files. May import `result` and the rooms below it.
 """
 
 from factorsfm.export.colmap import write_colmap

@@ -15,12 +15,12 @@ CAMERA, FOOTAGE = "camera.txt", "footage.txt"
 def write_after_effects(shot: Shot, folder: Path) -> None:
     """Write ``camera.txt`` and ``footage.txt``, After Effects' keyframe data.
 
-    Copy the text of each and paste it, at the start of a composition of the footage's size with square pixels: the
-    first one onto a one-node camera, the second one onto the footage's layer (2-D). Positions count in pixels from the
-    top left corner, y down, z into the picture, the origin of the world in the middle of the composition; orientation
-    in degrees (first z, then y, then x). The optical axis of After Effects goes through the middle of the composition:
-    where the lens's does not, or where its focal lengths differ, the second text moves and stretches the footage.
-    Distortion is not included; frames that are not registered have no key.
+    The user makes a composition of the footage's size with square pixels, goes to its start, and pastes the text of the
+    first file onto a one-node camera and the text of the second one onto the footage's 2-D layer. Positions are pixels
+    from the top left corner, y down, z into the picture, with the origin of the world in the middle of the composition;
+    orientation is in degrees (first z, then y, then x). In After Effects the optical axis goes through the middle of
+    the composition and pixels are square. Where the lens differs, the second text moves and stretches the footage.
+    Distortion is not included. Unregistered frames have no key.
     """
     lens = shot.lens
     middle = np.array([lens.width / 2, lens.height / 2, 0.0])
@@ -41,7 +41,7 @@ def write_after_effects(shot: Shot, folder: Path) -> None:
         ),
     ]
     for name, tracks in ((CAMERA, camera), (FOOTAGE, footage)):
-        # A folder's text files are pasted by hand: lines end as After Effects itself ends them.
+        # Line ends as in After Effects' own keyframe data.
         (folder / name).write_text(_keyframe_data(shot, tracks), encoding="ascii", newline="\r\n")
 
 

@@ -12,10 +12,10 @@ CAMERA, POINTS = "camera", "points"
 
 
 def write_alembic(shot: Shot, path: Path) -> None:
-    """Write an archive (Ogawa); the time of a frame is its number over the frame rate.
+    """Write an archive (Ogawa); the time of a frame is its number divided by the frame rate.
 
-    The focal length is in mm, the film back in cm, as Alembic wants them. Only registered frames have a sample, at
-    their time: tools interpolate between them. Distortion is not included.
+    The focal length is in mm and the film back in cm, as Alembic requires. Only registered frames have a sample; tools
+    interpolate between them. Distortion is not included.
 
     Raises:
         InputError: alembic3d is missing.
@@ -35,7 +35,7 @@ def write_alembic(shot: Shot, path: Path) -> None:
 
 
 def _check_room(path: Path, size: int) -> None:
-    """Where the disk is full, Alembic ends the whole program; this raises an OSError before."""
+    """Raise an OSError if the disk is full; Alembic would abort the whole process."""
     with path.open("wb") as file:
         file.write(bytes(size))
 

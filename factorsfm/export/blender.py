@@ -84,14 +84,14 @@ scene.frame_set(DATA["range"][0])
 
 
 def write_blender(shot: Shot, path: Path) -> None:
-    """Write a script for Blender 3.4 or newer: run it there, or ``blender --python camera.py``.
+    """Write a script for Blender 3.4 or newer, which is run in Blender or with ``blender --python camera.py``.
 
-    It adds a collection to the open scene and sets the scene's size, pixel aspect, frame rate and range. Frames that
-    are not registered have no key (Blender interpolates); the camera's custom property ``not_registered`` lists them.
-    Blender's camera does not distort: put undistorted plates behind it.
+    It adds a collection to the open scene and sets the scene's size, pixel aspect, frame rate and range. Unregistered
+    frames have no key (Blender interpolates); the camera's custom property ``not_registered`` lists them. Blender's
+    camera has no distortion, so the footage behind it should be undistorted.
 
     Raises:
-        InputError: the footage is a folder of images that are no numbered sequence.
+        InputError: the footage is a folder whose images are not a numbered sequence.
     """
     text = json.dumps(_data(shot), allow_nan=False)
     title = '"""Builds the animated camera, the points and the footage of a factorsfm reconstruction in Blender."""'
@@ -101,7 +101,7 @@ def write_blender(shot: Shot, path: Path) -> None:
 def _data(shot: Shot) -> dict[str, Any]:
     lens = shot.lens
     fps = round(shot.fps)
-    # One of the two is 1 in Blender, the other one is at least 1.
+    # In Blender one of the two is 1 and the other one at least 1.
     pixel_aspect = max(lens.pixel_aspect, 1.0), max(1 / lens.pixel_aspect, 1.0)
     return {
         "size": (lens.width, lens.height),
@@ -124,7 +124,7 @@ def _data(shot: Shot) -> dict[str, Any]:
 
 
 def _quaternions(shot: Shot) -> list[list[float]]:
-    """Order w, x, y, z; the signs such that neighbours are close, since Blender interpolates each number."""
+    """Quaternions w, x, y, z, with signs that keep neighbours close, since Blender interpolates each number."""
     found: list[list[float]] = []
     for matrix in shot.world_from_film:
         x, y, z, w = pycolmap.Rotation3d(matrix[:3, :3]).quat

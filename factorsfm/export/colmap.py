@@ -1,4 +1,4 @@
-"""The sparse model as COLMAP's text or binary files, which pycolmap, Gaussian-splat trainers and others read."""
+"""The sparse model as COLMAP's text or binary files, for COLMAP, pycolmap, Gaussian-splat trainers and others."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from factorsfm.result.reconstruction import Reconstruction
 
 
 class _Observations(NamedTuple):
-    """The observations that are written, sorted by frame; all arrays (k,) but `xy` (k, 2)."""
+    """The observations to write, sorted by frame: arrays (k,), and `xy` (k, 2)."""
 
     frame: NDArray[np.int64]
     point: NDArray[np.int64]
@@ -29,11 +29,10 @@ class _Observations(NamedTuple):
 def write_colmap(reconstruction: Reconstruction, folder: str | Path) -> None:
     """Write ``cameras.txt``, ``images.txt`` and ``points3D.txt``; the folder is made if absent.
 
-    One camera for each lens of the registered frames. The image id is the frame index + 1, the point id the row in
-    ``reconstruction.points`` + 1. Points seen from fewer than two registered frames are left out. Pixel centres lie at
-    0.5, as in all of COLMAP.
-    The text format cannot hold white space in an image name; where there is some, the binary files are
-    written as well (readers prefer them).
+    There is one camera for each lens of the registered frames. The image id is the frame index + 1, the point id the
+    row in ``reconstruction.points`` + 1. Points seen from fewer than two registered frames are left out. Pixel centres
+    are at 0.5, as everywhere in COLMAP. The text format cannot hold white space in an image name. If a name has some,
+    the binary files are written as well, which readers prefer.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -64,7 +63,7 @@ def write_colmap(reconstruction: Reconstruction, folder: str | Path) -> None:
 
 
 def write_colmap_binary(reconstruction: Reconstruction, folder: str | Path) -> None:
-    """Write ``cameras.bin``, ``images.bin``, ``points3D.bin`` and what else COLMAP keeps; content as `write_colmap`."""
+    """Write ``cameras.bin``, ``images.bin``, ``points3D.bin`` and COLMAP's further files; content as `write_colmap`."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as text:
@@ -138,7 +137,7 @@ def _point_lines(reconstruction: Reconstruction, observations: _Observations) ->
 
 
 def _mean_errors(observations: _Observations, count: int) -> NDArray[np.float64]:
-    """(count,) mean reprojection error of each point; -1, COLMAP's "unknown", where there is none."""
+    """(count,) mean reprojection error of each point; -1, COLMAP's "unknown", without observations."""
     known = np.isfinite(observations.error)
     number = np.bincount(observations.point[known], minlength=count)
     total = np.bincount(observations.point[known], observations.error[known], minlength=count)

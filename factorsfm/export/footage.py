@@ -21,7 +21,7 @@ class Sequence:
     """Images ``folder / (prefix + number + suffix)`` for each number from `first` to `last`.
 
     Attributes:
-        digits: to which the numbers are padded with zeros.
+        digits: the numbers are padded with zeros to this length.
     """
 
     folder: Path
@@ -36,15 +36,15 @@ class Sequence:
 
     @property
     def pattern(self) -> str:
-        """With a placeholder in the style of printf."""
+        """The path with a placeholder in the style of printf."""
         return (self.folder / f"{self.prefix}%0{self.digits}d{self.suffix}").as_posix()
 
 
 def background(shot: Shot) -> Path | Sequence | None:
-    """The movie file or the sequence of images to put behind the scene; its first frame is the source's frame 0.
+    """The movie file or the sequence of images behind the scene; its first frame is frame 0 of the source.
 
     Raises:
-        InputError: the user gave a folder of images that are no numbered sequence.
+        InputError: the user gave a folder whose images are not a numbered sequence.
     """
     path = shot.footage
     if path is None:
@@ -64,7 +64,7 @@ def image_sequence(folder: Path) -> Sequence:
     """The numbered images in a folder; other files are ignored.
 
     Raises:
-        InputError: no images, or not numbered without gaps, as film tools need it.
+        InputError: there are no images, or their numbers have gaps, which film tools do not accept.
     """
     names = [path.name for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES]
     matches = [_NUMBERED.fullmatch(name) for name in names]

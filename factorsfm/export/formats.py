@@ -1,4 +1,4 @@
-"""The formats by name, and the one call that writes any of them."""
+"""The formats by name, and the function that writes any of them."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ _AS_RECONSTRUCTED = Defaults()
 
 @dataclass(frozen=True, slots=True)
 class Format:
-    """One way to hand a reconstruction on.
+    """An export format.
 
     Attributes:
         description: in a few words.
         write: called with the shot and a path: a new file, or an empty folder.
         is_folder: whether the format is a folder of files.
-        defaults: what it takes where the options say nothing.
+        defaults: values of options that the user does not set.
     """
 
     description: str
@@ -81,7 +81,7 @@ FORMATS = {
 }
 
 
-_ANY_SIZES = ("colmap", "colmap-binary", "nerfstudio", "ply", "tum", "kitti")  # the others have one film back
+_ANY_SIZES = ("colmap", "colmap-binary", "nerfstudio", "ply", "tum", "kitti")  # all other formats have one film back
 
 
 def export(
@@ -90,13 +90,13 @@ def export(
     """Write a reconstruction for another tool; all of it or nothing.
 
     Args:
-        path: the file, or for the formats that consist of several files the folder, new, empty, or holding an earlier
-            export of the same kind. An earlier file is replaced.
+        path: the file; for formats with several files the folder: new, empty, or with an earlier export of this format.
+            An earlier export is replaced.
         format: a name from `FORMATS`.
 
     Raises:
-        InputError: an unknown format, a package of an extra missing, no registered frame, an image name that leaves
-            its folder, or the path cannot be written.
+        InputError: the format is unknown, a package that it needs is missing, no frame is registered, an image name
+            leaves its folder, or the path cannot be written.
     """
     if format not in FORMATS:
         raise InputError(f'"{format}" is no export format; the formats are {", ".join(FORMATS)}')

@@ -6,5 +6,5 @@ from pathlib import PurePath
 
 
 def image_name(name: str) -> str:
-    """Frames of a video are named by a bare number; other programs expect the name of an image file."""
+    """The name of a frame as that of an image file; the frames of a video are named by a number alone."""
     return name if PurePath(name).suffix else f"{name}.png"

@@ -21,7 +21,7 @@ from factorsfm.support.json_text import json_text
 
 logger = logging.getLogger(__name__)
 
-# Ours: nerfstudio's camera model, and its names of the parameters behind the principal point.
+# COLMAP's model: nerfstudio's model, and its names of the parameters after the principal point.
 _MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
     "SIMPLE_PINHOLE": ("OPENCV", ()),
     "PINHOLE": ("OPENCV", ()),
@@ -37,10 +37,10 @@ _MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
 
 
 def write_nerfstudio(shot: Shot, folder: Path) -> None:
-    """Write ``transforms.json``, ``points.ply`` and, where the footage is at hand, ``images/``.
+    """Write ``transforms.json``, ``points.ply`` and, if the footage is available, ``images/``.
 
-    Camera axes x right, y up, looking along -z; the principal point counts from the image's corner; distortion is
-    included. A frame with a lens of its own has its parameters beside it. Frames that are not registered are left out.
+    Camera axes are x right, y up, looking along -z. The principal point counts from the image's corner. Distortion is
+    included. If frames do not share one lens, each has its own parameters. Unregistered frames are left out.
 
     Raises:
         InputError: nerfstudio does not know the lens model, or the footage lacks frames.
@@ -51,7 +51,7 @@ def write_nerfstudio(shot: Shot, folder: Path) -> None:
     models = {lens.pop("camera_model") for lens in lenses}
     if len(models) > 1:
         raise InputError(f"nerfstudio takes lenses of one model, not {' and '.join(sorted(models))} together")
-    shared = {} if r.has_own_lenses else lenses[0]  # nerfstudio takes what all share before what a frame has
+    shared = {} if r.has_own_lenses else lenses[0]  # shared values hide those of a frame
     content = {
         "camera_model": models.pop(),
         **shared,
@@ -95,10 +95,10 @@ def _lens(camera: pycolmap.Camera) -> dict[str, Any]:
 
 
 def _write_images(footage: Path, names: dict[int, str], folder: Path) -> None:
-    """Image files are copied as they are, frames of a video are written without loss.
+    """Copy image files, and write the frames of a video as images without loss.
 
     Args:
-        names: of the files to write, by index in the footage.
+        names: of the images, by index in the footage.
     """
     for name in names.values():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)

@@ -22,15 +22,16 @@ SCRIPT, POINTS = "camera.nk", "points.obj"
 # Corners of a tetrahedron around its middle, and its faces.
 _CORNERS = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], np.float64)
 _FACES = np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]])
-_BESIDE_SCRIPT = r"\[file dirname \[value root.name]]/"  # an expression, kept from being evaluated while loading
+_BESIDE_SCRIPT = r"\[file dirname \[value root.name]]/"  # an expression that Nuke must not evaluate while loading
 
 
 def write_chan(shot: Shot, path: Path) -> None:
     """Write one line per registered frame: ``frame tx ty tz rx ry rz vfov``.
 
-    Angles in degrees, rotation order ZXY (Nuke's default: first z, then x, then y), vertical field of view. Frames that
-    are not registered have no line. The format has no room for a principal point off the middle, for distortion, or for
-    the film back, which the tool must be told: sensor width, and sensor width times height over width.
+    Angles are in degrees, in the rotation order ZXY (Nuke's default: first z, then x, then y); ``vfov`` is the vertical
+    field of view. Unregistered frames have no line. The format cannot hold distortion, a principal point off the
+    centre, or the film back, which the user must set in the tool: sensor width, and sensor width times height over
+    width.
     """
     angles = angles_zxy(shot.world_from_film[:, :3, :3])
     fields = [math.degrees(2 * math.atan(lens.height / (2 * lens.fy))) for lens in shot.lenses]
@@ -44,11 +45,10 @@ def write_chan(shot: Shot, path: Path) -> None:
 def write_nuke(shot: Shot, folder: Path) -> None:
     """Write a script with camera, points, lens and footage, and the files that it reads.
 
-    The script undistorts the footage with one STMap, renders the points through the camera on the undistorted plate,
-    and, beside that, distorts the render with the other STMap and lays it over the original footage. Where the lens
-    does not distort there is no STMap. The principal point is in the camera's window translation, a ratio of the
-    focal lengths in its window scale (the format's pixels are square). Frames that are not registered have no key and a
-    note lists them.
+    The script undistorts the footage with one STMap and renders the points over the undistorted plate. Beside that, it
+    distorts the render with the other STMap and lays it over the original footage. A lens without distortion has no
+    STMaps. The principal point is in the camera's window translation, the ratio of the focal lengths in its window
+    scale (the format's pixels are square). Unregistered frames have no key; a note lists them.
 
     Raises:
         InputError: the package that writes the STMaps is missing.
@@ -147,7 +147,7 @@ def _camera(shot: Shot) -> str:
 
 
 def _window_translation(lens: Lens) -> tuple[float, float]:
-    """In halves of the film back's width, in both directions; taken off before Nuke divides by the window's scale."""
+    """The window translation, in halves of the film back's width; Nuke subtracts it before it divides by the scale."""
     return 2 * lens.right / lens.sensor_width, 2 * lens.up / lens.sensor_width
 
 
@@ -178,7 +178,7 @@ def _pair(x: float, y: float) -> str:
 
 
 def _quoted(text: str) -> str:
-    """As a Tcl string that stands for just this text."""
+    """A Tcl string literal of this text."""
     return '"' + re.sub(r'([\\"\[$])', r"\\\1", text) + '"'
 
 
@@ -187,7 +187,7 @@ def _number(value: float) -> str:
 
 
 def _tetrahedra(points: Array, size: float) -> str:
-    """Each point as a small tetrahedron around it: every version of every tool reads and shows them."""
+    """The points as OBJ: a small tetrahedron around each, since not all tools show bare points."""
     vertices = (points[:, None] + size / 2 * _CORNERS).reshape(-1, 3)
     faces = (4 * np.arange(len(points))[:, None, None] + _FACES + 1).reshape(-1, 3)
     return "".join(_obj_lines("v", vertices.tolist())) + "".join(_obj_lines("f", faces.tolist()))

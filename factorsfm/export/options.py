@@ -1,4 +1,4 @@
-"""What a user may choose about an export."""
+"""The options of an export."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 from factorsfm.support.errors import InputError
 
-# What every format can hold; beyond, a unit has been mistaken.
+# Values that every format can hold; a value outside has probably another unit.
 _RANGES: dict[str, tuple[float, float, str]] = {
     "fps": (1e-3, 1e6, "frames per second"),
     "first_frame": (-1e9, 1e9, "the number of a frame"),
@@ -18,7 +18,7 @@ _RANGES: dict[str, tuple[float, float, str]] = {
 
 
 class UpAxis(StrEnum):
-    """The world axis that points upwards in the first frame; the world stays right-handed and its x points right."""
+    """The world axis that points up in the first frame; the world is right-handed and its x axis points right."""
 
     Y = "y"  # x right, y up, z towards the viewer: Nuke, USD, Alembic
     Z = "z"  # x right, y into the picture, z up: Blender, nerfstudio
@@ -27,20 +27,20 @@ class UpAxis(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExportOptions:
-    """Choices for every format; None takes the format's own default (`factorsfm.export.FORMATS`).
+    """Options of all formats; None is the default of the format (`factorsfm.export.FORMATS`).
 
     Attributes:
-        fps: frames per second; None takes the frame rate of the source where its timestamps tell it, else 24.
-        first_frame: number, in the target's timeline, of the first frame of the source (index 0), whether or not that
-            frame is part of the reconstruction: so the numbers fit the footage.
-        sensor_width: width of the film back in mm. Focal lengths in mm follow from it; the picture does not change.
-        up_axis: axis that points upwards in the first frame.
-        scale: length in the exported file of one world unit of the reconstruction.
-        footage: the shot, a video file or a folder of images; None takes the source that was reconstructed, if it is
-            still there.
+        fps: frames per second; None takes the frame rate from the timestamps of the source, or 24 without them.
+        first_frame: number of the source's frame 0 in the timeline of the target, even if the reconstruction does not
+            include that frame. So the numbers match the footage.
+        sensor_width: width of the film back in mm. It sets the focal length in mm and does not change the picture.
+        up_axis: axis that points up in the first frame.
+        scale: length of one world unit of the reconstruction in the exported file.
+        footage: the shot, a video file or a folder of images; None takes the source of the reconstruction, if it still
+            exists.
 
     Raises:
-        InputError: a value that makes no sense.
+        InputError: a value is out of range, or the footage does not exist.
     """
 
     fps: float | None = None

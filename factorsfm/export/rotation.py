@@ -1,4 +1,4 @@
-"""Rotations as the angles of film tools, in degrees."""
+"""Rotations as Euler angles of film tools, in degrees."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ Array = NDArray[np.float64]
 def angles_zxy(rotation: Array) -> Array:
     """(k, 3) degrees about x, y, z with ``rotation = Ry @ Rx @ Rz``: first z, then x, then y (Nuke's ZXY).
 
-    Without jumps of a full turn from one row to the next.
+    Unwrapped: no jumps of 360 degrees between rows.
 
     Args:
         rotation: (k, 3, 3).
     """
-    # Swapping the names of x and y turns Ry Rx Rz into Rx Ry Rz, and, as a mirror does, every angle into its negative.
+    # Exchanging x and y turns Ry Rx Rz into Rx Ry Rz. It is a reflection, so it negates every angle.
     swapped = rotation[:, [1, 0, 2]][:, :, [1, 0, 2]]
     y, x, z = _angles(swapped).T
     return _without_jumps(np.column_stack([-x, -y, -z]))
@@ -25,7 +25,7 @@ def angles_zxy(rotation: Array) -> Array:
 def angles_zyx(rotation: Array) -> Array:
     """(k, 3) degrees about x, y, z with ``rotation = Rx @ Ry @ Rz``: first z, then y, then x (After Effects).
 
-    Without jumps of a full turn from one row to the next.
+    Unwrapped: no jumps of 360 degrees between rows.
 
     Args:
         rotation: (k, 3, 3).

@@ -1,8 +1,8 @@
-"""A reconstruction as the film tools see it: numbered frames, cameras that look along -z, a lens in millimetres.
+"""A reconstruction in the conventions of film tools: frame numbers, cameras that look along -z, a lens in millimetres.
 
-Film tools share one camera: x right, y up, looking along -z. The reconstruction's cameras have OpenCV axes (x right,
-y down, z forward), and the first camera is the world. An export turns the world such that the chosen axis points
-upwards in the first frame, and scales it; it does not level the horizon.
+The cameras of film tools have x right, y up, and look along -z. Those of a reconstruction have OpenCV axes (x right, y
+down, z forward), and without control the first camera is the origin of the world. An export rotates the world so that
+the chosen axis points up in the first frame, and scales it. It does not level the horizon.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ _TURNED_WORLD = {  # exported world from the reconstruction's
     UpAxis.Y: np.diag([1.0, -1.0, -1.0]),
     UpAxis.Z: np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
 }
-_FILM_CAMERA = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV's camera axes from those of film tools
-# The models that are a pinhole where all parameters besides the focal length and the principal point are 0.
+_FILM_CAMERA = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV camera axes from film camera axes
+# Models that equal a pinhole if all parameters besides focal length and principal point are 0.
 _PINHOLE_IF_ZERO = frozenset({"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"})
 _DEFAULT_FPS = 24.0
 _FRAME_RATES = (24000 / 1001, 24.0, 25.0, 30000 / 1001, 30.0, 48.0, 50.0, 60000 / 1001, 60.0)
@@ -34,7 +34,7 @@ _FRAME_RATES = (24000 / 1001, 24.0, 25.0, 30000 / 1001, 30.0, 48.0, 50.0, 60000 
 
 @dataclass(frozen=True, slots=True)
 class Defaults:
-    """What a format takes where the options say nothing."""
+    """Default values of a format."""
 
     up_axis: UpAxis = UpAxis.MINUS_Y
     scale: float = 1.0
@@ -45,8 +45,8 @@ class Defaults:
 class Lens:
     """The pinhole part of the camera, with a film back of a given width.
 
-    Lengths on the film back are in mm. The height of the film back has the pixels' real aspect, so that
-    `focal_length` holds for both directions.
+    Lengths on the film back are in mm. The height of the film back follows from the pixel aspect, so that one
+    `focal_length` is valid in both directions.
 
     Attributes:
         width, height: pixels.
@@ -89,18 +89,18 @@ class Lens:
 
 @dataclass(frozen=True)
 class Shot:
-    """What the writers of a format are given.
+    """The input of the writer of a format.
 
     Attributes:
-        reconstruction: turned and scaled to the exported world; covariances and prior fits are left out.
+        reconstruction: rotated and scaled to the exported world, without covariances and prior fits.
         fps: frames per second.
-        first_frame: number of the source's frame 0.
+        first_frame: number of frame 0 of the source.
         sensor_width: mm.
-        world: (3, 3) rotation, exported world from that of the reconstruction.
+        world: (3, 3) rotation from the world of the reconstruction to the exported world.
         scale: exported length of one world unit.
-        up_axis: axis of the exported world that points upwards in the first frame.
-        footage: the video file or folder of images, None where there is none.
-        options: as the user gave them.
+        up_axis: axis of the exported world that points up in the first frame.
+        footage: the video file or folder of images, or None.
+        options: of the user.
     """
 
     reconstruction: Reconstruction
@@ -124,12 +124,12 @@ class Shot:
 
     @cached_property
     def numbers(self) -> list[int]:
-        """Numbers of the registered frames; the others have no key in any format."""
+        """Numbers of the registered frames."""
         return [self.first_frame + frame.index for frame in self.reconstruction.registered]
 
     @property
     def lost(self) -> list[int]:
-        """Numbers of the frames that are not registered."""
+        """Numbers of the unregistered frames."""
         return [self.first_frame + frame.index for frame in self.reconstruction.frames if not frame.registered]
 
     @cached_property
@@ -158,7 +158,7 @@ class Shot:
 
     @property
     def zooms(self) -> bool:
-        """Whether the registered frames have lenses of their own."""
+        """Whether the frames do not share one lens."""
         return self.reconstruction.has_own_lenses
 
     def _pinhole(self, camera: pycolmap.Camera) -> Lens:
@@ -174,25 +174,25 @@ class Shot:
 
     @property
     def distorts(self) -> bool:
-        """Whether the lens does anything that a pinhole does not."""
+        """Whether the lens has distortion."""
         camera = self.reconstruction.camera
         return camera.model_name not in _PINHOLE_IF_ZERO or bool(np.any(camera.params[camera.extra_params_idxs()]))
 
     @property
     def linear_colors(self) -> NDArray[np.float32]:
-        """(n, 3) colours of the points from 0 to 1, in linear light as renderers count."""
+        """(n, 3) colours of the points from 0 to 1, in linear light."""
         srgb = self.reconstruction.colors / 255
         linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
         return np.asarray(linear, dtype=np.float32)
 
     @property
     def clipping(self) -> tuple[float, float]:
-        """Distances between which everything in the scene lies; a 24-bit depth buffer can resolve them."""
+        """Near and far clipping distance, around the whole scene and within the range of a 24-bit depth buffer."""
         return 5 * self.point_size, 1e5 * self.point_size
 
     @property
     def point_size(self) -> float:
-        """A size at which the points can be told apart and be seen: 1/500 of their median distance."""
+        """A size at which points are visible and do not overlap: 1/500 of their median distance."""
         points = self.reconstruction.points
         if not len(points) or not self.numbers:
             return 0.01 * self.scale
@@ -201,7 +201,11 @@ class Shot:
 
 
 def make_shot(reconstruction: Reconstruction, options: ExportOptions, defaults: Defaults) -> Shot:
-    """Fill in the defaults of a format, and turn and scale the world."""
+    """Fill in the defaults of a format, and rotate and scale the world.
+
+    Raises:
+        InputError: the scaled scene is not finite.
+    """
     up_axis = UpAxis(options.up_axis) if options.up_axis is not None else defaults.up_axis
     scale = options.scale if options.scale is not None else defaults.scale
     world = _TURNED_WORLD[up_axis]
@@ -233,7 +237,7 @@ def _in_world(reconstruction: Reconstruction, world: NDArray[np.float64], scale:
 
 
 def _source_fps(frames: list[FrameResult]) -> float | None:
-    """The frame rate that the timestamps tell, a usual one where it is meant."""
+    """The frame rate from the timestamps, rounded to a standard rate that is very near."""
     timed = [frame for frame in frames if frame.timestamp is not None]
     if len(timed) < 2:
         return None

@@ -1,4 +1,4 @@
-"""The lens as a pair of images that say for each pixel where to look, and footage without distortion."""
+"""The distortion of the lens as a pair of STMaps, and undistorted footage."""
 
 from __future__ import annotations
 
@@ -25,14 +25,13 @@ _SAME = 1e-3  # pixels; two points closer than that are one
 
 
 def write_stmaps(shot: Shot, folder: Path) -> None:
-    """Write ``undistort.exr`` and ``distort.exr``: 32-bit float, red is x and green is y of the place to look at.
+    """Write ``undistort.exr`` and ``distort.exr``: 32-bit float; red and green hold the x and y to look up.
 
-    Places count in widths and heights of the image from its bottom left corner, to a pixel's centre: the map that
-    changes nothing holds ``(column + 0.5) / width`` and ``1 - (row + 0.5) / height``, rows counted from the top. Blue
-    is 0. `undistort.exr` makes footage straight, `distort.exr` bends a render to fit the footage. Size, focal length
-    and principal point are the same before and after, so the exported camera fits the straight footage as it is. Where
-    there is nothing to look at, both hold -1. A lens that zooms has a pair for each registered frame, which carry its
-    number: ``undistort.1001.exr``.
+    Positions count in widths and heights of the image from its bottom left corner, to a pixel's centre: the identity
+    map holds ``(column + 0.5) / width`` and ``1 - (row + 0.5) / height``, with rows counted from the top. Blue is 0.
+    `undistort.exr` undistorts footage, `distort.exr` distorts a render to fit the footage. Both keep size, focal length
+    and principal point, so the exported camera fits the undistorted footage. Pixels without a counterpart hold -1. A
+    zoom has a pair for each registered frame, with the number of the frame: ``undistort.1001.exr``.
 
     Raises:
         InputError: the package that writes EXR files is missing.
@@ -43,13 +42,13 @@ def write_stmaps(shot: Shot, folder: Path) -> None:
 
 
 def write_undistorted(shot: Shot, folder: Path) -> None:
-    """Write every frame of the footage without distortion, as ``plate.NUMBER.png``; 8 bits per channel, cubic.
+    """Write every frame of the footage undistorted, as ``plate.NUMBER.png``: 8 bits per channel, cubic interpolation.
 
-    Also the frames that are not registered, and those outside of the range that was reconstructed: the plates take
-    the footage's place as it is. Where a lens zooms, these are taken with that of the frame before.
+    Unregistered frames and frames outside of the reconstructed range are included, so that the plates can replace the
+    footage. With a zoom, such a frame uses the lens of the frame before it.
 
     Raises:
-        InputError: there is no footage, or it has another size than the camera.
+        InputError: there is no footage, or its size is not that of the camera.
     """
     camera = shot.reconstruction.camera
     if shot.footage is None:
@@ -70,7 +69,7 @@ def write_undistorted(shot: Shot, folder: Path) -> None:
 
 
 def _cameras(shot: Shot) -> list[tuple[str, pycolmap.Camera]]:
-    """The lenses, and what their maps have in their names."""
+    """The lenses, each with the suffix of its maps' names."""
     if not shot.zooms:
         return [("", shot.reconstruction.camera)]
     registered = zip(shot.numbers, shot.reconstruction.registered, strict=True)
@@ -78,15 +77,15 @@ def _cameras(shot: Shot) -> list[tuple[str, pycolmap.Camera]]:
 
 
 def _straightening(camera: pycolmap.Camera) -> NDArray[np.float32]:
-    """(2, h, w) x and y where the pixels of the undistorted image are found; centres at integers."""
+    """(2, h, w) x and y in the distorted image of each pixel of the undistorted one; centres at integers."""
     places = np.nan_to_num(_distorted_places(camera), nan=-max(camera.width, camera.height)) - PIXEL_CENTER
     return np.asarray(np.moveaxis(places, -1, 0), np.float32)
 
 
 def _distorted_places(camera: pycolmap.Camera) -> Array:
-    """(h, w, 2) where in the distorted image the pixels of the undistorted one are: pixels from the corner.
+    """(h, w, 2) position in the distorted image of each pixel of the undistorted one, in pixels from the corner.
 
-    NaN beyond the angle up to which the lens model is one-to-one: it folds back there.
+    NaN beyond the angle up to which the lens model is invertible.
     """
     focal, principal = _focal_and_principal(camera)
     rays = (_pixels(camera) - principal) / focal
@@ -97,7 +96,7 @@ def _distorted_places(camera: pycolmap.Camera) -> Array:
 
 
 def _undistorted_places(camera: pycolmap.Camera) -> Array:
-    """(h, w, 2) where in the undistorted image the pixels of the distorted one are: pixels from the corner."""
+    """(h, w, 2) position in the undistorted image of each pixel of the distorted one, in pixels from the corner."""
     rays = np.asarray(camera.cam_from_img(_pixels(camera)), np.float64)
     focal, principal = _focal_and_principal(camera)
     return (rays * focal + principal).reshape(camera.height, camera.width, 2)

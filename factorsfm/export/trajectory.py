@@ -24,8 +24,8 @@ def write_trajectory(reconstruction: Reconstruction, path: str | Path) -> None:
 def write_tum(shot: Shot, path: Path) -> None:
     """The TUM format: ``seconds tx ty tz qx qy qz qw``, camera-to-world, OpenCV camera axes.
 
-    The time is the frame's own in the source where it is known and no frame rate was asked for, else the frame's index
-    over the frame rate. A frame that is not registered has no line.
+    The time is the frame's timestamp. Without timestamps, or if the user sets a frame rate, it is the frame's index
+    divided by the frame rate. Unregistered frames have no line.
     """
     frames = shot.reconstruction.registered
     timed = shot.options.fps is None and all(frame.timestamp is not None for frame in frames)
@@ -36,7 +36,7 @@ def write_tum(shot: Shot, path: Path) -> None:
 def write_kitti(shot: Shot, path: Path) -> None:
     """The KITTI odometry format: one line per frame, the first three rows of camera-to-world; OpenCV camera axes.
 
-    The line tells the frame, so a frame that is not registered has a line, too: twelve times ``nan``.
+    The line number is the frame, so an unregistered frame has a line, too, with twelve ``nan``.
     """
     rows = np.full((len(shot.reconstruction.frames), 12), np.nan)
     rows[[frame.registered for frame in shot.reconstruction.frames]] = shot.world_from_opencv[:, :3].reshape(-1, 12)

@@ -17,13 +17,13 @@ CAMERA, POINTS = "/factorsfm/camera", "/factorsfm/points"
 def write_usd(shot: Shot, path: Path) -> None:
     """Write the stage; the path's suffix chooses text (.usda) or binary (.usdc, .usd).
 
-    By default in centimetres, a world unit counting as a metre. Apertures and focal length are in tenths of the
-    stage's unit as USD wants them, so they are millimetres in a stage in centimetres. The principal point is in the
-    aperture offsets. One sample per registered frame; USD interpolates between them, and the stage's custom data
-    ``notRegistered`` lists the frames without. Distortion is not included.
+    By default the stage is in centimetres and one world unit is a metre. Apertures and focal length are in tenths of
+    the stage's unit, as USD requires: millimetres in a stage in centimetres. The principal point is in the aperture
+    offsets. There is one sample per registered frame; USD interpolates between them, and the stage's custom data
+    ``notRegistered`` lists the other frames. Distortion is not included.
 
     Raises:
-        InputError: usd-core is missing, the suffix is none of USD's, or the up axis is none that a stage can have.
+        InputError: usd-core is missing, the suffix is not one of USD, or the up axis is not one of USD.
     """
     gf, sdf, usd, geom, vt = (require(f"pxr.{name}") for name in ("Gf", "Sdf", "Usd", "UsdGeom", "Vt"))
     if path.suffix not in (".usd", ".usda", ".usdc"):

@@ -1,4 +1,4 @@
-"""The packages of the extra ``vfx``, imported where a format needs them."""
+"""Optional packages of the extras ``vfx`` and ``alembic``, imported when a format needs them."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ _EXTRA_OF_MODULE = {"OpenEXR": "vfx", "pxr": "vfx", "alembic3d": "alembic", "ima
 
 
 def require(module: str) -> Any:
-    """The module; its root has to be one of the known ones.
+    """Import a module of an optional package.
 
     Raises:
-        InputError: it is not installed; says how to get it.
+        InputError: the package is not installed; the message says how to install it.
     """
     try:
         return import_module(module)
@@ -29,7 +29,7 @@ def require(module: str) -> Any:
 
 @contextmanager
 def failures_as_os_errors() -> Iterator[None]:
-    """These packages raise a plain RuntimeError where a file cannot be written."""
+    """Turns the RuntimeError that these packages raise for a file into an OSError."""
     try:
         yield
     except RuntimeError as error:

@@ -1,4 +1,4 @@
-"""Output that appears when it is complete: a file or a folder, all of it or nothing."""
+"""Files and folders that appear only when they are complete."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ from factorsfm.support.program import PROGRAM
 
 @contextmanager
 def complete_file(path: Path) -> Iterator[Path]:
-    """A file to write; it takes its place, also that of an earlier file, when the block ends without an error.
+    """Yields a temporary path to write; the file moves to `path` when the block ends without an error.
+
+    An earlier file is replaced.
 
     Raises:
         InputError: it cannot be written.
@@ -28,10 +30,10 @@ def complete_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def complete_folder(path: Path) -> Iterator[Path]:
-    """A folder to write into; it takes its place when the block ends without an error.
+    """Yields a temporary folder to write into; it moves to `path` when the block ends without an error.
 
-    A folder that exists is accepted if it holds nothing but files of the same names: an earlier export. Its entries are
-    replaced one by one, since it may be a mount point or the working directory.
+    A folder that exists is accepted if all of its files have the names of new ones: an earlier export. Its entries are
+    replaced one by one, since the folder may be a mount point or the working directory.
 
     Raises:
         InputError: it cannot be written, or it holds something else.
@@ -50,7 +52,7 @@ def complete_folder(path: Path) -> Iterator[Path]:
 
 
 def rename_all(moves: Iterable[tuple[Path, Path]]) -> None:
-    """Rename one after the other, (from, to); an error takes everything back."""
+    """Rename paths one by one, each from the first to the second; after an error, all renames are undone."""
     done: list[tuple[Path, Path]] = []
     try:
         for source, target in moves:
@@ -64,7 +66,7 @@ def rename_all(moves: Iterable[tuple[Path, Path]]) -> None:
 
 
 def exchanged(directory: Path, new: Path, replaced: Path, names: Iterable[str]) -> list[tuple[Path, Path]]:
-    """The renames that put the entries of `new` into `directory`, and what has their names there into `replaced`."""
+    """The renames that move entries of `new` to `directory`, and earlier entries of the same names to `replaced`."""
     moves = [((directory / name, replaced / name), (new / name, directory / name)) for name in names]
     return [move for pair in moves for move in pair if os.path.lexists(move[0])]
 

@@ -1,4 +1,4 @@
-"""Further images for a finished reconstruction: registered on what it has, whose coordinates stay."""
+"""Further images for a finished reconstruction, registered in its coordinates."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from factorsfm.tracks.image_tracks import ImageTracks
 from factorsfm.tracks.match_tracks import tracks_from_matches
 from factorsfm.tracks.matches import match_images
 
-_MOST_OF_A_SHOT = 40  # frames of a shot with which new images are matched
+_MOST_OF_A_SHOT = 40  # frames of a shot that new images are matched with
 _SAME_ASPECT = 0.01
 
 
@@ -50,19 +50,18 @@ def add_images(
 ) -> Reconstruction:
     """Register further images of the same lens on a finished reconstruction of a shot or of a set.
 
-    The new images are matched with those of the result; what both see is triangulated from the known poses. Cameras
-    that are known stay exactly where they are, unless they are to be refined; points that new images see, too, become
-    more exact by that.
+    The new images are matched with those of the result, and common features are triangulated from the known poses. The
+    known cameras stay exactly where they are, unless `refine` is set. Points that new images see are refined.
 
     Args:
         result: a reconstruction, or the folder of a result.
-        images: a folder, a video file, or any iterable of images. Images of the result's own source that have no pose
-            yet, or were outside of its range, keep their index; others are counted on from there.
-        source: the images of the result where they are not at their old place any more.
+        images: a folder, a video file, or any iterable of images. Images of the result's source that have no pose
+            or were outside of its range keep their index; others get the next indices.
+        source: the images of the result, if they have moved.
         frames: range of the new images.
-        refine: adjust all cameras and points together; the result stays in its coordinates as a whole.
-        work: folder for copies, features and matches, from which an interrupted run goes on; None keeps nothing.
-        progress: called with the stage, the images done, and their number where it is known.
+        refine: adjust all cameras and points together, and align the result with its old coordinates.
+        work: folder for copies, features and matches, which an interrupted run uses again; None keeps nothing.
+        progress: told the stage, the images done, and their number.
 
     Raises:
         InputError: the result, its images or the new ones cannot be used.
@@ -86,16 +85,16 @@ def add_images(
 
 
 class _Extension:
-    """The images of a result and the new ones, until they are one reconstruction."""
+    """The steps from a result and new images to one reconstruction."""
 
     def __init__(self, base: Reconstruction, folder: Path, refine: bool) -> None:
         self._base, self._folder, self._refine = base, folder, refine
         self._frames = [replace(frame) for frame in base.frames]
         self._known: list[MatchedImage] = []
-        self._absent: set[int] = set()  # rows of known images that cannot be matched: turned ones, and no files
+        self._absent: set[int] = set()  # rows of known images that cannot be matched: they were turned, or were arrays
         self._new: list[MatchedImage] = []
         self._added = added_images(base.options)
-        # The world in which everything is solved: the first camera, and a median distance of 1.
+        # All is solved in the coordinates of the first camera, with a median inverse distance of 1.
         first = base.registered[0].cam_from_world
         assert first is not None
         distance = np.linalg.norm(first * base.points, axis=1) if len(base.points) else np.ones(1)
@@ -105,7 +104,7 @@ class _Extension:
     # --- images -------------------------------------------------------------------------------------------------
 
     def take_known(self, source: str | Path | None, report: Progress) -> None:
-        """The images of the result, as far as they are matched with new ones."""
+        """Read the images of the result that are matched with the new ones."""
         rows = [row for row, frame in enumerate(self._frames) if frame.registered]
         if not self._base.options.get("unordered") and len(rows) > _MOST_OF_A_SHOT:
             rows = [rows[k] for k in np.linspace(0, len(rows) - 1, _MOST_OF_A_SHOT).astype(int)]
@@ -140,7 +139,7 @@ class _Extension:
     def take_new(
         self, images: str | Path | Iterable[Frame | NDArray[np.uint8]], frames: slice | None, report: Progress
     ) -> None:
-        """The images to add."""
+        """Read the images to add."""
         used = {frame.index for frame in self._frames}
         row_of = {(frame.index, frame.name): row for row, frame in enumerate(self._frames)}
         names = {frame.name for frame in self._frames if frame.registered}
@@ -180,7 +179,7 @@ class _Extension:
             self._added.append(AddedImages(None if path is None else str(path), first))
 
     def _misfit(self, image: Frame) -> str:
-        """Why an image cannot be of the result's camera; empty where it can."""
+        """Why an image cannot be from the result's camera; empty if it can."""
         (height, width), camera = image.image.shape[:2], self._base.camera
         if abs(width * camera.height / (height * camera.width) - 1.0) < _SAME_ASPECT:
             return ""
@@ -196,7 +195,7 @@ class _Extension:
     # --- steps --------------------------------------------------------------------------------------------------
 
     def run(self, report: Progress) -> Reconstruction:
-        """Match, register, adjust."""
+        """Match, register and adjust."""
         report("matching", 0, None)
         views = [*self._known, *self._new]
         tracks = self._match(views)

@@ -1,4 +1,4 @@
-"""The photographs of an image set: what is known of each, and its working copy."""
+"""The photographs of an image set and their working copies."""
 
 from __future__ import annotations
 
@@ -25,15 +25,16 @@ MAX_SIDE = 3200  # pixels; larger images are matched and reconstructed at this s
 
 @dataclass(slots=True)
 class Photo:
-    """What is kept of an image: never its pixels.
+    """A photograph of a set, without its pixels.
 
     Attributes:
         index, name, timestamp: see `Frame`.
-        file: its copy in the work folder, empty where the image is left out; size: (width, height) of the copy.
-        full_size: (width, height) of the image itself.
-        left_out: why it takes no part, empty where it does; twin: position of an earlier image with the same pixels.
-        remark: what a user should know of it.
-        focal_ratio: focal length over the longer side from EXIF, 0 where it is unknown.
+        file: name of the copy in the work folder, empty if the photograph is left out; size: (width, height) of the
+            copy.
+        full_size: (width, height) of the photograph.
+        left_out: why the photograph is not used, empty if it is; twin: position of an earlier one with the same pixels.
+        remark: note for the user.
+        focal_ratio: focal length divided by the longer side, from EXIF; 0 if unknown.
         camera: position in the list of the set's cameras.
     """
 
@@ -51,10 +52,10 @@ class Photo:
 
 
 class PhotoFolder:
-    """Working copies of the images and masks of a set, one for all images with the same pixels.
+    """Working copies of the images and masks of a set; images with the same pixels share one.
 
     Args:
-        folder: of the copies; those of an earlier run are used again.
+        folder: of the copies; copies of an earlier run are used again.
         masked: whether the images have masks.
     """
 
@@ -65,10 +66,10 @@ class PhotoFolder:
         self.images.mkdir(parents=True, exist_ok=True)
 
     def keep(self, frame: Frame, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None, position: int) -> Photo:
-        """Copy an image, (h, w, 3) BGR, and what is ignored in it.
+        """Copy an image, (h, w, 3) BGR, and its mask.
 
         Args:
-            position: of the photo in the set.
+            position: of the photograph in the set.
 
         Raises:
             InputError: the folder cannot be written.
@@ -109,7 +110,7 @@ class PhotoFolder:
 
 
 def pixel_digest(image: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None) -> str:
-    """By which the same pixels, and the same mask, are known again: 128 bits, so that no two others ever share it."""
+    """Identifies an image with its mask: a hexadecimal digest of 128 bits, so different images never share one."""
     digest = hashlib.blake2b(f"{image.shape}".encode(), digest_size=16)
     for pixels in (image, mask) if mask is not None else (image,):
         digest.update(np.ascontiguousarray(pixels).data)
@@ -117,7 +118,7 @@ def pixel_digest(image: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None
 
 
 def size_text(size: tuple[int, int]) -> str:
-    """(width, height) in words."""
+    """(width, height) as text."""
     return f"{size[0]}x{size[1]}"
 
 
@@ -136,10 +137,10 @@ def _bounded(
 
 
 def write_once(path: Path, image: NDArray[np.uint8]) -> None:
-    """Write an image into a work folder, unless it is there; a file there is complete.
+    """Write an image into a work folder, unless the file exists; an existing file is always complete.
 
     Raises:
-        InputError: it cannot be written.
+        InputError: the file cannot be written.
     """
     if path.exists():
         return
@@ -154,10 +155,10 @@ def write_once(path: Path, image: NDArray[np.uint8]) -> None:
 
 @contextmanager
 def work_folder(work: str | Path | None) -> Iterator[Path]:
-    """The folder, or a temporary one where there is none.
+    """Yields the folder, or a temporary one for None.
 
     Raises:
-        InputError: it cannot be made.
+        InputError: the folder cannot be made.
     """
     if work is not None:
         try:

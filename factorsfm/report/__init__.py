@@ -1,6 +1,6 @@
-"""What a person looks at: the HTML report, the overlay, the picture, and the folder of a result.
+"""The HTML report, the overlay, the picture, and the folder of a result.
 
-Takes a `Reconstruction`, gives files. May import `export` and what lies below it.
+Takes a `Reconstruction`, gives files. May import `export` and the rooms below it.
 """
 
 from factorsfm.report.page import failure_html, report_html

@@ -1,4 +1,4 @@
-"""The numbers of every frame that the report draws as charts."""
+"""The charts of the report: one number per frame."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _Item = TypeVar("_Item")
 
 @dataclass(frozen=True, slots=True)
 class Chart:
-    """One value per frame, NaN where there is none.
+    """One value per frame, NaN if unknown.
 
     Attributes:
         std: standard deviations, drawn as a band; pale: a second line, drawn behind; both may be empty.
@@ -40,7 +40,7 @@ class Chart:
 
 
 def charts(frames: Sequence[FrameResult], prior_residual: NDArray[np.float64], unit: str) -> list[Chart]:
-    """The charts of which at least one number is known and not 0.
+    """All charts with at least one known number that is not 0.
 
     Args:
         prior_residual: (frames,) median magnitude of the relative residual.
@@ -69,7 +69,7 @@ def charts(frames: Sequence[FrameResult], prior_residual: NDArray[np.float64], u
 
 
 def short(values: Iterable[float]) -> list[float]:
-    """Five significant digits are enough to draw."""
+    """Numbers with five significant digits, enough for a drawing."""
     return [float(f"{value:.5g}") for value in values]
 
 
@@ -79,7 +79,7 @@ def _chart(title: str, values: Iterable[float], *, std: Iterable[float] = (), pa
 
 
 def _read(items: Sequence[_Item | None], number: Callable[[_Item], float]) -> list[float]:
-    """A number of each item, NaN where there is no item."""
+    """A number of each item, NaN for None."""
     return [np.nan if item is None else number(item) for item in items]
 
 

@@ -1,4 +1,4 @@
-"""What the script of the report draws: plain data, arrays as base64 of little-endian values."""
+"""The data for the script of the report: plain values, and arrays as base64 of little-endian numbers."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _NONE = -(2**15)
 
 
 def reconstruction_data(reconstruction: Reconstruction) -> dict[str, Any]:
-    """Everything that the report of a reconstruction draws."""
+    """All data for the report of a reconstruction."""
     view = scene(reconstruction, _MAX_POINTS)
     camera = reconstruction.camera
     unit = "m" if reconstruction.metric else "units"
@@ -48,7 +48,7 @@ def reconstruction_data(reconstruction: Reconstruction) -> dict[str, Any]:
 def frames_data(
     frames: Sequence[FrameResult], prior_residual: NDArray[np.float64] | None = None, unit: str = "units"
 ) -> dict[str, Any]:
-    """What is known of the frames, also of those of a shot that failed."""
+    """The data of the frames, also of a shot that failed."""
     if prior_residual is None:
         prior_residual = np.full(len(frames), np.nan)
     return {
@@ -65,7 +65,7 @@ def frames_data(
 
 
 def _tracks_data(found: Tracks, cameras: Sequence[pycolmap.Camera]) -> dict[str, Any]:
-    """Places as 16-bit fractions of the image, residuals and the prior's relative residuals as 16-bit steps."""
+    """Positions as 16-bit fractions of the image; residuals of tracks and prior as 16-bit steps."""
     sizes = np.array([(camera.width, camera.height) for camera in cameras])
     place = (found.xy + 0.5) / sizes[found.position]
     return {

@@ -1,4 +1,4 @@
-"""What all pages have in common: one HTML file each, with everything inside, that asks nobody for anything."""
+"""The frame of all pages: one self-contained HTML file that needs no network."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def document(title: str, body: str, *, styles: str = "", scripted: bool = False)
 
     Args:
         title: plain text; body: HTML; styles: CSS besides that of all pages.
-        scripted: whether the body has scripts, which are refused otherwise.
+        scripted: whether scripts in the body may run.
     """
     page = Template(packaged("factorsfm.report", "document.html")).substitute(
         title=escape(title),
@@ -26,5 +26,5 @@ def document(title: str, body: str, *, styles: str = "", scripted: bool = False)
 
 
 def packaged(package: str, name: str) -> str:
-    """The text of a file that comes with a package."""
+    """The text of a file that is part of a package."""
     return files(package).joinpath(name).read_text(encoding="utf-8")

@@ -29,7 +29,7 @@ _LIBRARIES = ("gtsam", "pycolmap", "opencv-python-headless", "onnxruntime", "num
 
 
 def report_html(reconstruction: Reconstruction) -> str:
-    """The report as one self-contained HTML document: styles, scripts and data are inside, no network."""
+    """The report as one HTML document that contains all styles, scripts and data."""
     return _document(
         grade=grade(reconstruction),
         verdict=verdict_sentence(reconstruction),
@@ -46,7 +46,7 @@ def report_html(reconstruction: Reconstruction) -> str:
 def failure_html(
     reason: str, frames: Sequence[FrameResult], options: Mapping[str, Any], seconds: Mapping[str, float]
 ) -> str:
-    """The report of a shot that could not be reconstructed: why, and what became of each frame."""
+    """The report of a shot that could not be reconstructed: the reason, and the status of each frame."""
     return _document(
         grade="Not solved",
         verdict="The camera of this shot could not be solved.",
@@ -85,7 +85,7 @@ def _document(
         timings=_table({stage: f"{value:.2f} s" for stage, value in with_total(seconds).items()}),
         versions=_table(_versions()),
         options=_table(_flat(options)),
-        # "</" would end the script element
+        # the browser takes "</" for the end of the script element
         data=json_text(data, indent=None).replace("</", "<\\/"),
         script="".join(packaged("factorsfm.report", name) for name in _SCRIPTS),
     )

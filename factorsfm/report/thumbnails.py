@@ -1,4 +1,4 @@
-"""Small pictures of the frames for the report, in bounded memory."""
+"""Thumbnails of the frames for the report, in bounded memory."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _MOST = 240  # about 4 MB
 
 
 class Thumbnails(Closing):
-    """Small JPEGs of a stream of frames: of every frame, of a longer shot of every second, fourth, ... one.
+    """Small JPEGs of a stream of frames: of every frame, or in a long shot of every second, fourth, ... frame.
 
     Example:
         >>> with Thumbnails() as thumbnails:
@@ -36,7 +36,7 @@ class Thumbnails(Closing):
         self._step = 1
 
     def add(self, image: NDArray[np.uint8]) -> None:
-        """Take the next frame, (h, w, 3) BGR or (h, w) grey."""
+        """Add the next frame, (h, w, 3) BGR or (h, w) grey."""
         if self._added % self._step == 0:
             self._kept[self._added] = self._worker.submit(thumbnail, image.copy())
         self._added += 1
@@ -49,27 +49,30 @@ class Thumbnails(Closing):
         self._worker.shutdown()
 
     def by_frame(self) -> list[bytes | None]:
-        """One entry per frame that was added, None where none is kept."""
+        """One entry per added frame, None for frames without a thumbnail."""
         return [self._kept[k].result() if k in self._kept else None for k in range(self._added)]
 
     def state(self) -> dict[str, Any]:
-        """Everything that `restore` needs."""
+        """The state for `restore`."""
         kept = {position: np.frombuffer(jpeg.result(), np.uint8) for position, jpeg in self._kept.items()}
         return {"kept": kept, "added": self._added, "step": self._step}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Go on where `state` was taken."""
+        """Continue from a `state`."""
         self._kept = {position: _done(jpeg.tobytes()) for position, jpeg in state["kept"].items()}
         self._added, self._step = state["added"], state["step"]
 
     def attach(self, frames: Sequence[FrameResult]) -> None:
-        """Give the frames their thumbnails; they are those that were added, in the same order."""
+        """Give the frames their thumbnails.
+
+        Args:
+            frames: the added ones, in the same order."""
         for frame, jpeg in zip(frames, self.by_frame(), strict=True):
             frame.thumbnail = jpeg
 
 
 def thumbnail(image: NDArray[np.uint8]) -> bytes:
-    """A JPEG at most 384 pixels wide: halved as often as that takes, which is fast, and brought to size."""
+    """A JPEG at most 384 pixels wide; large images are halved first, which is fast."""
     while image.shape[1] >= 2 * _WIDTH:
         height, width = max(1, image.shape[0] // 2), image.shape[1] // 2
         even = image[: 2 * height, : 2 * width]

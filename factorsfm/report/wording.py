@@ -1,4 +1,4 @@
-"""What a result means, in the words of those who use it: no jargon of the estimator."""
+"""Sentences about a result in the language of compositors."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.result.summary import median_reprojection_error, registered_share
 from factorsfm.support.status import FrameStatus, ShotKind
 
-_DOUBTFUL_PX = 1.0  # median reprojection error; tracks are good to a tenth of a pixel
-_NO_SHARE = 0.05  # of the depth prior, below which it is not worth a word
+_DOUBTFUL_PX = 1.0  # median reprojection error; good tracks have 0.1 pixels
+_NO_SHARE = 0.05  # of the depth prior, below which it is not mentioned
 _STATUS = {
     "registered": "solved",
     "lost": "the view is not in the map",
@@ -36,7 +36,7 @@ def grade(reconstruction: Reconstruction) -> str:
 
 
 def grade_of(registered: int, frames: int, error_px: float) -> str:
-    """The verdict on so many frames of a shot, with this median reprojection error (NaN: unknown)."""
+    """The verdict for a number of registered frames and a median reprojection error (NaN: unknown)."""
     if not registered:
         return "Not solved"
     if error_px > _DOUBTFUL_PX:
@@ -45,7 +45,7 @@ def grade_of(registered: int, frames: int, error_px: float) -> str:
 
 
 def verdict_sentence(reconstruction: Reconstruction) -> str:
-    """What has been solved and how well it sits on the footage, in one sentence."""
+    """How many frames are solved, and how well the points fit the footage."""
     sentence = f"The camera is solved in {registered_share(reconstruction)}"
     error = median_reprojection_error(reconstruction)
     if np.isfinite(error):
@@ -54,7 +54,7 @@ def verdict_sentence(reconstruction: Reconstruction) -> str:
 
 
 def explanation(reconstruction: Reconstruction) -> list[str]:
-    """What one can do with the solve, sentence by sentence."""
+    """What the solve can be used for, in sentences."""
     sentences = [_motion(reconstruction)]
     if _is_doubtful(reconstruction):
         sentences.insert(0, "That is too far: the tracks contradict each other, or the scene moves by itself.")
@@ -80,7 +80,7 @@ def explanation(reconstruction: Reconstruction) -> list[str]:
 
 
 def failure_sentence(frames: Sequence[FrameResult]) -> str:
-    """What became of the frames of a shot that could not be solved."""
+    """The statuses of the frames of a shot that could not be solved."""
     counts = Counter(frame.status for frame in frames).most_common()
     found = "; ".join(f"{n} {'frame' if n == 1 else 'frames'}: {status_words(status)}" for status, n in counts)
     return f"{found}." if found else "No frame was read."

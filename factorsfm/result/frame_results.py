@@ -1,4 +1,4 @@
-"""What a polish says of each frame."""
+"""The result of each frame, from the polish."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _MAD_TO_SIGMA = 1.4826
 
 
 class SourceFrame(Protocol):
-    """What the result needs to know of a frame of the source."""
+    """A frame of the source."""
 
     @property
     def index(self) -> int: ...
@@ -36,12 +36,12 @@ def frame_results(
     camera: pycolmap.Camera,
     unit: float,
 ) -> list[FrameResult]:
-    """The result of every frame: of the registered ones as the polish left them, of the others why they are not.
+    """One result per frame, registered or not.
 
     Args:
         images, frames: of the source, in the same order.
-        camera: the lens as it was solved.
-        unit: length in the result of one unit of the polish.
+        camera: the lens after the polish.
+        unit: length of one unit of the polish in the result.
     """
     row_of = {position: row for row, position in enumerate(polished.frames)}
     results = []
@@ -66,7 +66,11 @@ def frame_results(
 
 
 def _add_solution(result: FrameResult, polished: Polished, row: int, camera: pycolmap.Camera, unit: float) -> None:
-    """Pose, covariance, lens and inliers of the camera with a row in the polish."""
+    """Add pose, covariance, lens and inliers of a camera.
+
+    Args:
+        row: of the camera in the polish.
+    """
     state, lens = polished.state, polished.lens
     rotation = pycolmap.Rotation3d(state.rotation[row])
     result.cam_from_world = pycolmap.Rigid3d(rotation, state.translation[row] * unit)

@@ -1,4 +1,4 @@
-"""Where the images of a result are: in its own source, and in those of the images that were added later."""
+"""The files that hold the images of a result: its own source, and the sources of images that were added later."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from factorsfm.support.json_reading import typed
 
 @dataclass(frozen=True, slots=True)
 class AddedImages:
-    """Images that were added to a result, as its options keep them under "added".
+    """Images that were added to a result; its options hold a list of these under "added".
 
     Attributes:
-        source: the folder or video file, None where the images were no files.
-        first: index in the result of the source's image 0.
+        source: the folder or video file, None if the images were arrays.
+        first: index in the result of image 0 of this source.
     """
 
     source: str | None
@@ -26,11 +26,11 @@ class AddedImages:
 
 @dataclass(frozen=True, slots=True)
 class ImageSource:
-    """A folder or a video file, and which images of the result are in it.
+    """A folder or a video file that holds images of a result.
 
     Attributes:
-        path: None where the images were no files.
-        first: index in the result of the source's image 0.
+        path: None if the images were arrays.
+        first: index in the result of image 0 of this source.
         stop: index in the result of image 0 of the next source.
     """
 
@@ -39,12 +39,12 @@ class ImageSource:
     stop: float
 
     def holds(self, index: int) -> bool:
-        """Whether an image with this index in the result is from here."""
+        """Whether the image with this index in the result is from this source."""
         return self.first <= index < self.stop
 
 
 def added_images(options: Mapping[str, Any]) -> list[AddedImages]:
-    """What was added to a result with these options, in order.
+    """The images that were added to a result with these options, in order.
 
     Raises:
         InputError: the options are damaged.
@@ -56,7 +56,7 @@ def image_sources(main: Path, options: Mapping[str, Any]) -> list[ImageSource]:
     """All sources of a result.
 
     Args:
-        main: where the images are that it was made from; options: of the result.
+        main: the folder or video file that was reconstructed; options: of the result.
 
     Raises:
         InputError: the options are damaged.

@@ -22,7 +22,7 @@ class PriorFit:
 
     Attributes:
         scale, shift: in units of the prior's inverse depth (scale times the world unit).
-        scale_std, shift_std: standard deviations from the factor graph.
+        scale_std, shift_std: standard deviations from the polish.
         sigma: robust standard deviation of the residuals, in the prior's inverse depth.
     """
 
@@ -35,17 +35,17 @@ class PriorFit:
 
 @dataclass(frozen=True, slots=True)
 class LensFit:
-    """What the shot says of a lens that was not given. Standard deviations are None where a value is no estimate.
+    """How well an estimated lens is known. A standard deviation is None where the value was not estimated.
 
     Attributes:
-        determined: whether the shot says what the focal length is; otherwise it is the guess, or the mean of the guess
-            and what the shot says, each weighed as well as it is known.
-        focal_std: standard deviation of the focal length, relative; of a zoom the largest one; None for the guess,
-            and for a focal length that was held.
+        determined: whether the shot determines the focal length. Otherwise it is the guess, or the mean of guess and
+            estimate, weighted by their inverse variances.
+        focal_std: relative standard deviation of the focal length; the largest one if it changes. None if the focal
+            length is the guess or was held.
         k1_std, k2_std: of the radial distortion.
         cx_std, cy_std: of the principal point, in focal lengths.
-        zoom_std: of the ratio of the longest to the shortest focal length, relative, where a zoom was looked for. The
-            course of a zoom is an estimate even where the focal length as a whole is a guess.
+        zoom_std: relative standard deviation of the ratio of the longest to the shortest focal length, if a zoom was
+            searched. The ratio is an estimate even if the focal length as a whole is a guess.
     """
 
     determined: bool
@@ -59,14 +59,14 @@ class LensFit:
 
 @dataclass(frozen=True, slots=True)
 class RollingShutter:
-    """A shutter with which the rows of an image are read one after another.
+    """A shutter that reads the rows of an image one after another.
 
     Attributes:
-        readout: share of the time between two frames that passes from the first row to the last; negative where the
-            last one is read first. std: its standard deviation.
+        readout: time from the first row to the last, as a fraction of the time between two frames; negative if the
+            last row is read first. std: its standard deviation.
         along: "rows" from top to bottom, or "columns" from left to right, as in images that were turned upright.
-        recorded: whether the poses are those with which a camera without it would show the points most nearly as the
-            recorded images do; otherwise those of the moment when the middle of the image is read.
+        recorded: True if the poses are those of a global-shutter camera that best reproduces the recorded images;
+            False if they are the poses at the moment when the middle of the image is read.
     """
 
     readout: float
@@ -80,22 +80,23 @@ class FrameResult:
     """One frame of the source.
 
     Attributes:
-        index: position in the source, counted from 0 before any range or step is applied.
-        name: file name or the zero-padded index.
-        timestamp: seconds, where the container has it.
-        status, message: what became of it, and the same in words with numbers.
-        cam_from_world: pose, or None where the frame is not registered.
-        keyframe: whether it is a variable of the incremental graph.
-        observations, inliers: tracked points in the frame, and those that the final model explains.
-        reprojection_error: median over the inliers (pixels), NaN where not registered.
-        prior: fitted scale and shift of the depth prior, None where the frame carries none.
-        covariance: (6, 6) of (rotation vector, translation), a perturbation of `world_from_cam` on the right, relative
-            to the first registered camera in the scene's unit of length, which is the mean inverse distance of the
-            points; with control absolute, in the control's world and unit; None where not registered.
-        observability: what carries the pose, None where not registered.
-        thumbnail: a small JPEG of the image, None where none is kept.
-        camera: the lens of this frame where the frames do not share one, else None; see `Reconstruction.camera_of`.
-        focal_std: relative standard deviation of the focal length of this frame, where it is an estimate of its own.
+        index: position in the source, from 0, before any range or step is applied.
+        name: file name, perhaps with folders before it, or the zero-padded index.
+        timestamp: seconds, None if unknown.
+        status, message: whether the frame is registered or why not, and the same in words with numbers.
+        cam_from_world: pose, None if the frame is not registered.
+        keyframe: of a video, whether the mapper made the frame a keyframe: it triangulated points from it and gave its
+            pose to the live graph. Of an image set, every registered image is a keyframe.
+        observations, inliers: number of tracked points, and of those with a small reprojection error in the result.
+        reprojection_error: median over the observations (pixels), NaN if not registered.
+        prior: fitted scale and shift of the depth prior, None if the prior is not used in this frame.
+        covariance: (6, 6) of (rotation vector, translation), for a perturbation of `world_from_cam` on the right. It is
+            relative to the first registered camera, with the scene's scale fixed by the mean inverse distance of the
+            points; with control it is absolute, in the control's world and unit. None if unknown.
+        observability: how well tracks and prior determine the pose, None if unknown.
+        thumbnail: a small JPEG of the image, or None.
+        camera: the lens of this frame if the frames do not share one, else None; see `Reconstruction.camera_of`.
+        focal_std: relative standard deviation of the focal length of this frame, if it has its own estimate.
     """
 
     index: int
@@ -126,8 +127,8 @@ class Reconstruction:
     """Cameras, points and tracks of one shot.
 
     Attributes:
-        camera: the lens (COLMAP convention: pixel centres at 0.5); where frames have lenses of their own, with the
-            median of their focal lengths, or of an image set that of most images.
+        camera: the lens (COLMAP convention: pixel centres at 0.5). If the frames do not share one: for a zoom, the lens
+            with the median focal length; for an image set, the lens of most images.
         frames: one entry per frame of the source, in order.
         points: (n, 3) world coordinates.
         colors: (n, 3) uint8 RGB.
@@ -137,18 +138,19 @@ class Reconstruction:
         observation_xy: (m, 2) pixels, centres at integers (OpenCV).
         observation_error: (m,) reprojection error, pixels.
         prior_residual: (m,) residual of the depth prior relative to the predicted inverse depth
-            ``scale / z``, NaN where the observation carries no prior.
+            ``scale / z``, NaN for an observation without prior.
         kind: what the motion allows one to recover.
         parallax: largest camera displacement over the median point depth (paper, section 4).
-        point_std: (n,) standard deviation of the inverse distance of each point from the first registered camera,
-            relative to it, in the unit of `FrameResult.covariance`; None where it is not known.
-        lens: how far the shot determines the lens; None where it was given.
-        metric: whether the world unit is the metre (the prior is metric, or control says so).
-        control: what control did; None where there was none.
-        notes: sentences that a user should read (translation unobservable, focal length guessed, ...).
+        point_std: (n,) relative standard deviation of the inverse distance of each point from the first registered
+            camera, with the scale fixed as in `FrameResult.covariance`; None if unknown.
+        lens: how well the lens is known, None if it was given.
+        shutter: the rolling shutter, None if none was found.
+        metric: whether the world unit is the metre (from a metric prior, or from control).
+        control: how well the control is met, None without control.
+        notes: sentences for the user (translation unobservable, focal length guessed, ...).
         seconds: wall time by stage.
-        options: resolved options as plain data.
-        others: of an image set, the parts of the scene that cannot be joined to this one, largest first.
+        options: all options as plain data.
+        others: reconstructions of other parts of an image set that cannot be joined to this one, largest first.
     """
 
     camera: pycolmap.Camera
@@ -179,12 +181,12 @@ class Reconstruction:
         return [frame for frame in self.frames if frame.registered]
 
     def camera_of(self, frame: FrameResult) -> pycolmap.Camera:
-        """The lens with which a frame was taken."""
+        """The lens of a frame."""
         return frame.camera or self.camera
 
     @property
     def has_own_lenses(self) -> bool:
-        """Whether the focal length or more changes from frame to frame."""
+        """Whether the frames do not share one lens."""
         return any(frame.camera is not None for frame in self.frames)
 
     def camera_centers(self) -> NDArray[np.float64]:
@@ -194,12 +196,10 @@ class Reconstruction:
         ).reshape(-1, 3)
 
     def write(self, directory: str | Path) -> None:
-        """Write trajectory, COLMAP model, point cloud, summary and report; all of it or nothing.
-
-        Other parts of an image set are written in the same way into `part-002`, `part-003`, ... in it.
+        """Write trajectory, COLMAP model, point cloud, summary and report; see `result_folder.write_folder`.
 
         Raises:
-            InputError: the directory cannot be written.
+            InputError: the directory cannot be written, or holds something else than an earlier result.
         """
         from factorsfm.report.result_folder import write_folder
 

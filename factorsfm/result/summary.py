@@ -1,4 +1,4 @@
-"""A result in numbers: what summary.json holds and the report shows."""
+"""A result in numbers, for summary.json and the report."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from factorsfm.support.status import ShotKind
 
 
 def summary(reconstruction: Reconstruction) -> dict[str, Any]:
-    """Everything in numbers; NaN where a value does not exist (`json_text` turns it into null)."""
+    """The content of summary.json; a missing number is NaN here and null in the file."""
     return {
         "program": PROGRAM,
         "version": program_version(),
@@ -67,13 +67,13 @@ def failure_summary(
 
 
 def incomplete_summary() -> dict[str, Any]:
-    """The summary of a folder in which one result is being replaced by another."""
+    """The summary of a folder whose result is being replaced."""
     reason = "the program was stopped while it replaced an earlier result"
     return {**failure_summary(reason, (), {}, {}), "incomplete": True}
 
 
 def verdict(reconstruction: Reconstruction) -> str:
-    """What has been recovered, in one sentence for the user."""
+    """The result in one sentence for the user."""
     sentence = f"{registered_share(reconstruction)} registered, {len(reconstruction.points):,} points"
     error = median_reprojection_error(reconstruction)
     if math.isfinite(error):
@@ -85,18 +85,18 @@ def verdict(reconstruction: Reconstruction) -> str:
 
 
 def part_name(number: int) -> str:
-    """Folder, in that of the first part, of the result of another part of an image set; counted from 1."""
+    """Name of the folder of another part of an image set, inside the folder of part 1."""
     return f"part-{number:03d}"
 
 
 def registered_share(reconstruction: Reconstruction) -> str:
-    """All frames, or so many of them."""
+    """The number of registered frames in words."""
     frames, registered = len(reconstruction.frames), len(reconstruction.registered)
     return f"all {frames} frames" if registered == frames else f"{registered} of {frames} frames"
 
 
 def conclusion(reconstruction: Reconstruction, output: Path) -> str:
-    """What to say of a result that has been written."""
+    """The sentences that a command prints after it has written a result."""
     notes = [f"Note: {note}" for note in reconstruction.notes]
     parts = [f"{part_name(n)}: {verdict(other)}." for n, other in enumerate(reconstruction.others, 2)]
     return "\n".join(
@@ -105,31 +105,31 @@ def conclusion(reconstruction: Reconstruction, output: Path) -> str:
 
 
 def median_reprojection_error(reconstruction: Reconstruction) -> float:
-    """Median over all observations, pixels; NaN where there is none."""
+    """Median over all observations, pixels; NaN without observations."""
     errors = reconstruction.observation_error
     errors = errors[np.isfinite(errors)]
     return float(np.median(errors)) if len(errors) else float("nan")
 
 
 def focal_range(reconstruction: Reconstruction) -> tuple[float, float] | None:
-    """Shortest and longest focal length of the frames, pixels; None where they share one."""
+    """Shortest and longest focal length of the frames, pixels; None if they share one lens."""
     focals = [frame.camera.mean_focal_length() for frame in reconstruction.frames if frame.camera is not None]
     return (min(focals), max(focals)) if focals else None
 
 
 def pooled_observability(reconstruction: Reconstruction) -> dict[str, float] | None:
-    """Medians over the registered cameras, and the largest pixel slide; None where nothing is known."""
+    """Medians over the registered cameras, and the largest pixel slide; None if unknown."""
     cameras = [asdict(f.observability) for f in reconstruction.frames if f.observability is not None]
     if not cameras:
         return None
     columns = {name: np.array([camera[name] for camera in cameras]) for name in cameras[0]}
-    known = {name: values[np.isfinite(values)] for name, values in columns.items()}  # a camera may see no point
+    known = {name: values[np.isfinite(values)] for name, values in columns.items()}  # NaN for a camera without points
     pooled = {name: float(np.median(values)) if len(values) else math.nan for name, values in known.items()}
     return {**pooled, "largest_pixel_slide": max(known["pixel_slide"], default=math.nan)}
 
 
 def with_total(seconds: Mapping[str, float]) -> dict[str, float]:
-    """The stages, and their sum where no total has been measured."""
+    """The seconds by stage, with their sum as "total" if there is no total yet."""
     return {**seconds, "total": seconds.get("total", sum(seconds.values()))}
 
 

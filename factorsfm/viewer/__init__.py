@@ -1,4 +1,4 @@
-"""What a stream does, live or recorded, in Rerun.
+"""A stream in Rerun, live or recorded.
 
-Takes frames and updates, gives a recording. May import `streaming` and what lies below it.
+Takes frames and updates, gives a recording. May import `streaming` and the rooms below it.
 """

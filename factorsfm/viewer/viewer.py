@@ -1,4 +1,4 @@
-"""What a stream does, to look at: live in the viewer of Rerun, or recorded for it (extra ``viewer``)."""
+"""Shows a stream in the Rerun viewer, live or from a recording (extra ``viewer``)."""
 
 from __future__ import annotations
 
@@ -20,31 +20,31 @@ from factorsfm.support.context import Closing
 from factorsfm.support.errors import InputError
 
 _JPEG_QUALITY = 80
-_PATH_FRAMES = 240  # of the path as it was given that are shown
+_PATH_FRAMES = 240  # length of the shown path of live poses
 _MAPPED, _UNMAPPED = (80, 220, 100), (240, 170, 40)  # colours of tracks, RGB
 _CAMERA = "world/camera"
 _IMAGE = f"{_CAMERA}/image"
 
 
 class Viewer(Closing):
-    """Shows nothing; what a stream has unless a viewer was asked for."""
+    """The viewer that shows nothing."""
 
     def watch(self, depth: DepthPrior | None) -> DepthPrior | None:
-        """The same prior, whose maps are shown as they are made."""
+        """Wrap a prior so that its maps are shown."""
         return depth
 
     def log(self, frame: Frame, update: FrameUpdate, stream: Stream) -> None:
-        """Show what a push has brought."""
+        """Show a frame and its update."""
 
     def log_result(self, reconstruction: Reconstruction) -> None:
-        """Show the polished path and points, and what carries each pose."""
+        """Show the polished path and points, and the shares of prior and parallax in each pose."""
 
     def close(self) -> None:
-        """Write what has not been written yet."""
+        """Write everything that is not written yet."""
 
 
 def open_viewer(show: bool = False, record: str | Path | None = None) -> Viewer:
-    """A viewer as it is asked for; without any wish one that shows nothing.
+    """Open a viewer; without arguments, one that shows nothing.
 
     Args:
         show: open the window of Rerun.
@@ -118,7 +118,7 @@ class RerunViewer(Viewer):
         self._plot(scalars)
 
     def log_depth(self, frame: Frame, depth: DepthMap) -> None:
-        """Show a map of the prior, bright is near."""
+        """Show a map of the prior; bright is near."""
         values = depth.values if depth.kind is DepthKind.INVERSE else 1.0 / depth.values
         finite = np.isfinite(values)
         low, high = np.percentile(values[finite], [1, 99]) if finite.any() else (0.0, 1.0)
@@ -153,7 +153,7 @@ class RerunViewer(Viewer):
 
 
 class _Watched:
-    """A prior that shows its maps."""
+    """A prior that shows its maps in a viewer."""
 
     def __init__(self, depth: DepthPrior, viewer: RerunViewer) -> None:
         self._depth, self._viewer = depth, viewer
