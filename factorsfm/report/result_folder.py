@@ -129,10 +129,13 @@ def _replace_entries(directory: Path, new: Path, replaced: Path) -> None:
     replaced.mkdir()
     if summary.exists():
         shutil.copyfile(summary, before)
+    moves = [*exchanged(directory, new, replaced, sorted(names)), (new / _SUMMARY, summary)]
     try:
         _mark_incomplete(directory, new.parent)
-        rename_all([*exchanged(directory, new, replaced, sorted(names)), (new / _SUMMARY, summary)])
+        rename_all(moves)
     except BaseException:
+        if not all(os.path.lexists(source) for source, _ in moves):
+            raise  # not everything could be undone: the result stays incomplete
         if before.exists():
             before.replace(summary)
         else:

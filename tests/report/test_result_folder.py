@@ -3,6 +3,7 @@
 import os
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import cycle
 from pathlib import Path
 
 import pytest
@@ -102,6 +103,27 @@ def test_an_error_at_any_step_leaves_the_earlier_result(
             write(folder)
         assert contents(folder) == before
         assert len(list(folder.parent.iterdir())) == 2
+
+
+def test_what_cannot_be_undone_says_that_it_is_incomplete(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    next_failure = cycle((0, NEVER))  # the first step back fails, too
+
+    def fail() -> None:
+        interfering.countdown = next(next_failure)
+        raise OSError(5, "Input/output error")
+
+    interfering = Interfering(monkeypatch, fail)
+    for step in range(1, steps(folder, write_new, interfering)):
+        interfering.countdown = step
+        with pytest.raises(InputError, match="Input/output error"):
+            write_new(folder)
+        interfering.countdown = NEVER
+        assert not job(EARLIER, folder).is_done()
+        with pytest.raises(InputError, match="out is incomplete"):
+            read_result(folder)
+        write_folder(result(EARLIER, 3, folder), folder)
+        (folder / "picture.png").touch()
+    assert (folder / "mine" / "notes.txt").read_text() == "precious"
 
 
 @pytest.mark.parametrize("write", [write_new, write_reason])
