@@ -8,7 +8,7 @@ import pytest
 
 from factorsfm.graph.keyframe_graph import KeyframeGraph
 from factorsfm.mapping.map_copy import MapCopy
-from factorsfm.mapping.map_update import update_map
+from factorsfm.mapping.map_update import _COVARIANCE_INFLATION, update_map
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.mapping.point_map import PointMap
 from factorsfm.mapping.registration import register_image
@@ -190,55 +190,26 @@ def test_the_noise_is_what_the_residuals_show():
         assert low <= graph.window.sigma <= high
 
 
-def test_covariances_cover_the_errors():
-    """Errors of the free centres in standard deviations: on the safe side, since neighbouring tracks err alike."""
+def test_covariances_are_those_of_the_errors_but_for_their_inflation():
+    """Errors of the solved centres in standard deviations, over draws of independent noise.
+
+    Neighbouring tracks of real footage err alike, for which the covariances are inflated; these tracks do not. The
+    newest keyframe is left out: after a single step it has the weights of where it started. The weights of the Cauchy
+    kernel make covariances of Gaussian noise 1.6 times too large, which is a ratio of 0.78.
+    """
     problem, images = long_shot()
-    rng = np.random.default_rng(0)
-    for image in images:
-        noise = 0.25 * rng.standard_normal(image.tracks.pixels.shape)
-        image.tracks = replace(image.tracks, pixels=image.tracks.pixels + noise)
-    update = update_map(copy_of(problem, images, map_of(problem.points)), KeyframeGraph())
-    truth = problem.truth
-    errors = []
-    for k, (rotation, translation) in update.poses.items():
-        error = truth.rotation[k].T @ truth.translation[k] - rotation.T @ translation
-        errors.append(rotation @ error / np.sqrt(np.diag(update.covariances[k])[3:]))
-    assert 0.1 < np.sqrt(np.mean(np.square(errors))) < 1.0
-
-
-@pytest.mark.parametrize("knows_its_zero", [False, True])
-def test_the_camera_path_keeps_its_length_while_the_unit_is_free(knows_its_zero):
-    """Poses that were given already must fit those to come; a metric prior says better how long the path is."""
-    problem, images, points = handheld(guided=[0, 5], scale=1.2)
-    for k in (0, 5):
-        depth = replace(images[k].tracks.depth, free_shift=not knows_its_zero)
-        images[k].tracks = replace(images[k].tracks, depth=depth)
-    update = update_map(copy_of(problem, images, map_of(points)), KeyframeGraph())
-    before = sum(np.linalg.norm(image.translation) for image in images)
-    after = sum(np.linalg.norm(translation) for _, translation in update.poses.values())
-    assert (abs(after / before - 1) < 1e-9) != knows_its_zero
-    distance = np.median(np.linalg.norm(update.points, axis=1) * problem.truth.inverse_distance[update.ids])
-    scale = update.affines[5][0]
-    assert scale / distance == pytest.approx(1.2, rel=0.05)  # the affine follows the unit
-
-
-# --- new points -------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("prior", [False, True])
-def test_new_points_are_triangulated(prior):
-    problem, _, _ = handheld(noise_px=0.1)
-    images = mapped_images(problem, problem.truth, guided=range(6) if prior else ())
-    n = len(problem.points)
-    known = np.arange(n // 2)
-    update = update_map(copy_of(problem, images, map_of(problem.points, known)), KeyframeGraph())
-    assert update.committed
-    new = np.isin(update.ids, known, invert=True)
-    assert new.sum() == n - len(known)
-    relative = np.linalg.norm(update.points - problem.points[update.ids], axis=1) / np.linalg.norm(
-        update.points, axis=1
-    )
-    assert 1e-4 < np.median(relative[new]) < 0.05
+    truth, squares = problem.truth, []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        noisy = []
+        for image in images:
+            noise = 0.25 * rng.standard_normal(image.tracks.pixels.shape)
+            noisy.append(replace(image, tracks=replace(image.tracks, pixels=image.tracks.pixels + noise)))
+        update = update_map(copy_of(problem, noisy, map_of(problem.points)), KeyframeGraph())
+        for k, (rotation, translation) in list(update.poses.items())[:-1]:
+            error = rotation @ (truth.rotation[k].T @ truth.translation[k] - rotation.T @ translation)
+            squares.append(error @ np.linalg.solve(update.covariances[k][3:, 3:], error) / 3.0)
+    assert 0.65 < np.sqrt(_COVARIANCE_INFLATION * np.mean(squares)) < 0.8
 
 
 def test_there_is_room_for_so_many_landmarks():
