@@ -1,4 +1,4 @@
-"""The batch solver: residuals, variables and their columns, elimination, marginals, models of the errors.
+"""The batch solver: variables and their columns, residuals, elimination of the points, covariances, error models.
 
 Takes observations and a state, gives the state of least cost and its covariances. May import `tracks` and what
 lies below it.

@@ -1,9 +1,9 @@
 """Bundle adjustment: Levenberg-Marquardt over all variables of a `State`, the points eliminated first.
 
-In these shots every camera sees every point, so that what the points leave behind is one dense system. General solvers
-are about as fast, given the same ordering (GTSAM takes 0.7 to 2 times as long, Ceres 0.3 to 1.2 times). This one is
-here for what it models: errors that persist along a track, an unknown lens and shutter, and the smooth error of a depth
-prior. Points are unit bearings with an inverse distance, in which small motion is almost linear.
+In these shots every camera sees every point, so that the reduced system of the cameras is dense. General solvers are
+about as fast, given the same ordering: GTSAM takes 0.7 to 2 times as long, Ceres 0.3 to 1.2 times. This solver is here
+for its models: errors that persist along a track, an unknown lens and shutter, and the smooth error of a depth prior.
+Points are unit bearings with an inverse distance, in which small motion is almost linear.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class BundleAdjustment:
         self.columns = Columns.of(state)
         frames = len(state.rotation)
         held = np.arange(frames) == state.world if free.held is None else free.held
-        self.held = held | (np.bincount(observations.frame, minlength=frames) == 0)  # nothing says where they are
+        self.held = held | (np.bincount(observations.frame, minlength=frames) == 0)  # no observation determines them
         estimated = self._estimated()
         self._free = np.nonzero(estimated & free.cameras)[0]
         self.free_optics = np.nonzero(estimated[self.columns.optics])[0]
@@ -120,7 +120,7 @@ class BundleAdjustment:
         return self._tracks.costs(self.state)
 
     def error_inflation(self) -> float:
-        """By how much the errors of neighbouring tracks repeat each other, see `block_inflation`."""
+        """Factor on the variance because the errors of neighbouring tracks are correlated, see `block_inflation`."""
         place = self.state.normalized(self.observations)
         return block_inflation(self.reprojection_vectors(), self.observations.frame, place)
 

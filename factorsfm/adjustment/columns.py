@@ -1,4 +1,4 @@
-"""Where the variables of an adjustment lie among the columns of its linear system, the points apart."""
+"""The columns of an adjustment's linear system, after the points are eliminated: which variable each belongs to."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Index = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class Columns:
-    """Columns of the camera side: of every variable of a `State` but the points, estimated or not.
+    """Columns of the camera side: one for every variable of a `State` but the points, estimated or not.
 
     Attributes:
         poses: six a frame, a rotation vector before a translation (GTSAM's convention).

@@ -31,7 +31,7 @@ class Term:
     Attributes:
         residual: (d, m); by_camera: (c, d, m); by_point: (3, d, m).
         columns: (m, c) camera-side variables of `by_camera`; frame, point: (m,).
-        errors: how the residuals repeat each other; they are decorrelated then, the derivatives are not. None: not.
+        errors: correlation of the residuals, which are decorrelated then, unlike the derivatives; None: independent.
     """
 
     residual: Array
@@ -97,7 +97,7 @@ class Elimination:
         return Normal(camera, gradient, point, point_gradient, terms)
 
     def _take_away_repeated(self, camera: Array, t: Term, errors: TrackErrors, groups: list[Group]) -> None:
-        """From the information of the cameras, what residuals of a stretch say again and again."""
+        """Subtract from the information of the cameras what correlated residuals of a stretch count twice."""
         frames = np.array([t.frame[rows[0]] for rows, _, _ in groups])
         scale = errors.root_weight * np.sqrt(errors.shared)[errors.stretch]
         for window in np.unique(frames // STRETCH):

@@ -1,4 +1,4 @@
-"""Covariances of the polish, and what they are relative to."""
+"""Covariances of an adjustment in several gauges: relative to the first camera, or to the scene as a whole."""
 
 from __future__ import annotations
 

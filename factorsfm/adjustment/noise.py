@@ -1,4 +1,4 @@
-"""How large the errors of tracks are, and how far they repeat each other."""
+"""The size of the errors of tracks, and their correlation within blocks of the image and of time."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ Array = NDArray[np.float64]
 FIRST_SIGMA_PX = 0.25  # of a tracked point, until it is measured
 SMALLEST_SIGMA_PX = 0.03  # no track is better than this
 _RAYLEIGH_MEDIAN = 1.1774  # median of the norm of a 2-D error, in standard deviations
-_BLOCKS = (8, 5, 16)  # across, down, frames: in which errors may be alike
+_BLOCKS = (8, 5, 16)  # across, down, frames: in which errors may be correlated
 
 
 def typical_sigma(errors: Array) -> float:
@@ -24,7 +24,7 @@ def coordinate_sigma(errors: Array) -> float:
 
 
 def block_inflation(residual: Array, frame: NDArray[np.int64], place: Array) -> float:
-    """By how much errors of neighbouring tracks in neighbouring frames repeat each other: a factor on the variance.
+    """Factor on the variance because errors of neighbouring tracks in neighbouring frames are correlated.
 
     In a block of the image and of time, independent errors add up to the root of their number.
 

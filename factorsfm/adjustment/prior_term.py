@@ -1,4 +1,4 @@
-"""The depth prior as a term of the polish: its values, its weight, and the joint problem."""
+"""The depth prior in the polish: its values at the observations, its weight, and the joint problem."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ Index = NDArray[np.int64]
 
 logger = logging.getLogger(__name__)
 
-_LEAST_CORRELATION = 0.1  # with the reconstructed inverse depth; below this, or mirrored, a prior is none
+_LEAST_CORRELATION = 0.1  # with the reconstructed inverse depth; a prior below this is not used
 
 
 @dataclass(slots=True)
 class PriorPart:
-    """What the prior did.
+    """The prior as it took part in a solution.
 
     Attributes:
         weight: its measured error model.
@@ -69,7 +69,7 @@ def weigh_prior(
     images: Sequence[ImageTracks],
     inflation: float,
 ) -> WeighedPrior | None:
-    """Measure how far the prior can be trusted on this shot; None where there is none or it is no prior."""
+    """Measure the error model of the prior on this shot; None without a prior, or where it contradicts the geometry."""
     values = prior_values(images, observations, tracks)
     if values is None:
         return None

@@ -1,14 +1,14 @@
-"""How far a depth prior can be trusted, measured on the shot itself.
+"""The error model of a depth prior, measured on the shot itself.
 
-The errors of a network are smooth over the image and alike from frame to frame, so that hundreds of keypoints on ten
-keyframes are a handful of independent measurements. The error of the prior is modelled as
+The errors of a network are smooth over the image and correlated from frame to frame, so that hundreds of keypoints on
+ten keyframes are a handful of independent measurements. The error of the prior is modelled as
 
     ``d = a (1 / z + e(direction) + n) + b``,
 
 with a smooth field ``e`` that belongs to the scene (shared by all images, exponential correlation over the viewing
-direction) and a local rest ``n``. Their sizes are the most probable ones given the differences between the prior and
-the geometry, whose own joint covariance is known, and given what networks are usually like: where geometry is precise
-the differences show the network's error, where it is silent they say nothing and are not mistaken for precision.
+direction) and independent noise ``n`` of each point. Their sizes are the most probable ones given the differences
+between prior and geometry, the joint covariance of the geometry, and the usual sizes for networks. Where the geometry
+is precise, the differences show the network's error; where it is not, its covariance explains them.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Index = NDArray[np.int64]
 
 _SMOOTH = np.geomspace(0.05, 2.0, 9)  # candidate standard deviations, in units of the median inverse depth
 _LOCAL = np.geomspace(0.05, 0.8, 7)
-# What networks are like where the shot itself says little: means and spread (factor) of log-normal priors.
+# Usual sizes for networks: means and spread (a factor) of log-normal priors.
 _USUAL_SMOOTH, _USUAL_LOCAL, _USUAL_FACTOR = 0.4, 0.15, 2.0
 _LENGTHS = (0.15, 0.5)  # candidate correlation lengths, in units of the extent of the scene's directions
 _SAMPLE = 200  # points on which the likelihood is evaluated
@@ -37,7 +37,7 @@ class PriorWeight:
 
     Attributes:
         smooth: standard deviation of the smooth field.
-        local: standard deviation of the independent rest of a point.
+        local: standard deviation of the independent noise of a point.
         length: correlation length of the field, radians.
         correlation: of the prior with the reconstructed inverse depth, after scale and shift.
     """

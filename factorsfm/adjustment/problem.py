@@ -1,4 +1,4 @@
-"""What an adjustment estimates, what is known beforehand, and how its errors behave."""
+"""The parts of a problem beside observations and state: free variables, prior knowledge, the model of the errors."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Free:
-    """Which variables are estimated, beside the points. The shape of the lens is free as far as it has a prior.
+    """Which variables are estimated, beside the points; the shape of the lens is where it has a prior (`Known`).
 
     Attributes:
-        cameras: False holds everything but the points.
+        cameras: False keeps everything constant but the points.
         translation: False estimates rotations and bearings alone.
         focal: whether the focal lengths are estimated.
         held: (k,) frames whose poses are constant, None: the one that is the world. Frames without observations are
@@ -39,8 +39,8 @@ class ErrorModel:
 
     Attributes:
         sigma: standard deviation of a coordinate (pixels).
-        tracks: weights of the observations, and how far their errors repeat each other; the robust kernel then works
-            on the depth prior alone. None: independent errors with the kernel of the options.
+        tracks: weights of the observations, and the correlation of their errors; the robust kernel then works on the
+            depth prior alone. None: independent errors with the kernel of the options.
     """
 
     sigma: float
@@ -110,7 +110,7 @@ class LensPrior:
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """What is known beside the observations; None: nothing. The lens is constant where nothing is known of it."""
+    """Prior knowledge of focal lengths, lens and world, each None without any; the lens is constant then."""
 
     focal: FocalPrior | None = None
     lens: LensPrior | None = None
@@ -118,7 +118,7 @@ class Known:
 
     @property
     def terms(self) -> list[CameraTerm]:
-        """All that is known, as terms of the cost."""
+        """As terms of the cost."""
         return [term for term in (self.focal, self.lens, self.control) if term is not None]
 
 

@@ -81,8 +81,8 @@ def projection_by_pose(q: Array, focal: float) -> tuple[Array, Array]:
 def distort(uv: Array, lens: Array) -> tuple[Array, Array, Array]:
     """``u (1 + k1 r^2 + k2 r^4) + c``: radial distortion as COLMAP's RADIAL model has it, and a principal point.
 
-    Beyond a field of view that no such lens has the displacement stays what it is at its rim: a wrong match that is
-    predicted far outside of the image would say more of the distortion than all others.
+    Beyond 63 degrees off the axis the displacement stays constant: wrong matches that are predicted far outside of the
+    image would otherwise decide the distortion.
 
     Args:
         uv: (n, 2) undistorted normalised image coordinates.

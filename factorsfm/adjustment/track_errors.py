@@ -1,13 +1,13 @@
-"""Errors of tracks that persist: a patch slides, over many frames, along what it follows.
+"""Errors that persist along a track: over many frames, a patch slides along the edge that it follows.
 
-The error of an observation is modelled as a white part, alike for all tracks, and a part that stays the same while its
-track passes a stretch of frames and that each track has of its own size,
+The error of an observation is modelled as white noise, of the same size for all tracks, and a part that stays constant
+while its track passes a stretch of frames, of a size of each track's own,
 
     ``r = b(track, stretch) + n``,  ``b ~ N(0, tau(track)^2)``,  ``n ~ N(0, sigma^2)``.
 
-A track that slides says little of where the camera is, and as much as any other of how it moves from frame to frame;
-least squares that take the errors as independent get both wrong. All is measured on the residuals of the shot: where
-they do not persist, what remains is least squares with the weights of a robust kernel.
+A track that slides tells little of where the camera is, and as much as any other of its motion from frame to frame;
+least squares with independent errors get both wrong. The sizes are measured on the residuals of the shot: where errors
+do not persist, the cost is that of least squares with the weights of a robust kernel.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 STRETCH = 16  # frames
-_CLIP = 4.0  # standard deviations beyond which an error does not tell how far the others persist
-_SHRINKAGE = 60.0  # pairs of observations with which a track is taken to be like all
+_CLIP = 4.0  # standard deviations at which errors are clipped before their correlation is measured
+_SHRINKAGE = 60.0  # pairs of observations that the mean over all tracks counts for
 
 
 @dataclass(frozen=True, slots=True)
 class TrackErrors:
-    """How m residuals, sorted by point and frame, weigh, and how far they repeat each other.
+    """Weights and correlation of m residuals, sorted by point and frame.
 
     Attributes:
         sigma: standard deviation of the white part (pixels).

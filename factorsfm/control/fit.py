@@ -1,12 +1,8 @@
-"""What control did to a result."""
+"""The fit of a result to its control."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    pass
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,7 +12,7 @@ class ControlResidual:
     Attributes:
         name: of the item; unit: of `error` and `sigma`: "m", "degrees" or "px".
         error: length of the difference; sigma: as given; sigmas: the one over the other.
-        contradicts: whether the difference is so large that the item was given next to no weight.
+        contradicts: whether the difference is so large that the item has hardly any weight.
     """
 
     name: str
@@ -29,7 +25,7 @@ class ControlResidual:
 
 @dataclass(frozen=True, slots=True)
 class ControlFit:
-    """What the control did.
+    """How well a result agrees with its control.
 
     Attributes:
         residuals: of every item that was used.

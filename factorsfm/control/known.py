@@ -167,11 +167,11 @@ class KnownHeight:
 
 @dataclass(frozen=True, slots=True)
 class Control:
-    """Everything that is known beforehand.
+    """All known poses, points, distances and heights of a scene.
 
     Raises:
         InputError: nothing is known, a frame or a point is there twice, a point that is not there is referred to, or
-            what is known leaves open where the scene is in the control's world.
+            the control does not determine where the scene is in its world.
     """
 
     poses: Sequence[KnownPose] = ()

@@ -32,7 +32,7 @@ _CONTRADICTION = 4.0  # standard deviations
 _STEPS, _TOLERANCE = 25, 2e-5
 _COLLAPSE = 10.0  # fall of the logarithm of the scale with which a scene vanishes
 _POINT_STEPS = 5  # of the points alone, after cameras were put where they are held
-_POINT_SIGMA = 5.0  # the weak prior of the points must not hold the shape that the control is to change
+_POINT_SIGMA = 5.0  # a weak prior of the points: the control may change the shape of the scene
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ def solve_under_control(
         frames: position of each of its frames in the source.
 
     Raises:
-        ReconstructionError: what is known of the registered frames leaves open where the scene is, or contradicts
+        ReconstructionError: the control of the registered frames does not determine where the scene is, or contradicts
             the images so much that the scene vanishes.
     """
     control = SolvedControl(located, marks, frames, adjustment.state)
@@ -102,7 +102,7 @@ def _converged(
     sizes = [float(np.linalg.norm(r)) for r in term.residuals(state)]
     typical = float(np.median(sizes)) if sizes else 0.0
     solved = adjustment
-    # From afar the kernel must not take all control for wrong.
+    # At a start far away, a narrow kernel would take all control for outliers.
     for kernel in sorted({max(_KERNEL, 2.0 * typical), _KERNEL}, reverse=True):
         term.kernel = kernel
         solved = BundleAdjustment(

@@ -1,4 +1,4 @@
-"""Control in rows of a solution: what of it concerns the frames that are solved, and where its points are."""
+"""Control in rows of a solution: its poses, points and lengths in the frames that are solved."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _MARK_PX = 5.0  # largest error of a mark where its point starts
 
 
 class SolvedControl:
-    """The control as far as solved frames are concerned, in rows of a state.
+    """The control of the solved frames, in rows of a state.
 
     Args:
         marks: of all points of the control in the solved frames.

@@ -27,7 +27,7 @@ def start_under_control(control: SolvedControl, state: State) -> tuple[State, Co
     """The state with world alignment and marked points, the control as a term on it, and (k,) which frames are held.
 
     Raises:
-        ReconstructionError: the control leaves the scale, the rotation or the place of its world open.
+        ReconstructionError: the control does not determine scale, rotation or place of its world.
     """
     alignment = align_worlds(_correspondences(control, state), control.placed)
     held = np.zeros(len(state.rotation), bool)

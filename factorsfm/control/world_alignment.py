@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 _MOST_SUBSETS = 300
 _REWEIGHTINGS = 20
-_DISTINCT = 3.0  # standard deviations by which positions must differ, and lie off a line, to say something
+_DISTINCT = 3.0  # standard deviations by which positions must differ, and lie off a line, to determine anything
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,7 @@ def align_worlds(c: Correspondences, placed: bool) -> Similarity:
         placed: whether the control has a world of its own; where only lengths are known, the alignment is a scale.
 
     Raises:
-        ReconstructionError: what is known of the registered frames leaves the scale, the rotation or the place open.
+        ReconstructionError: the control of the registered frames does not determine scale, rotation and place.
     """
     length_scale = float(np.median(c.target_length / c.source_length)) if len(c.target_length) else None
     if not placed:
@@ -105,7 +105,7 @@ def _fit(c: Correspondences, weight: Array, turn: Array, length_scale: float | N
 
 
 def check_enough(target: Array, sigma: Array, turned: bool, measured: bool, source: Array | None = None) -> None:
-    """Insist that known positions, and what else is known, determine a scale, a rotation and a place.
+    """Insist that known positions, rotations and lengths determine a scale, a rotation and a place.
 
     Args:
         target: (n, 3) known positions; sigma: (n,); source: (n, 3) the same in the solution, if there is one yet.

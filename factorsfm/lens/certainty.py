@@ -1,4 +1,4 @@
-"""How certain a lens is: covariances from residuals that may be alike, and from leaving out parts of the shot."""
+"""Covariances of a lens: from residuals that may be correlated, and from leaving out parts of the shot."""
 
 from __future__ import annotations
 
@@ -14,16 +14,21 @@ from factorsfm.adjustment.state import LENS_SIZE
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-_CELLS = (6, 4)  # across and down, in which the errors of tracks may be alike
-_LEFT_OUT = (3, 2, 3)  # parts across, down and in time, of which one at a time is left out
+_CELLS = (6, 4)  # across and down, in which the errors of tracks may be correlated
+_LEFT_OUT = (3, 2, 3)  # parts across, down and in time; one at a time is left out
 
 
 def lens_deviations(
     adjustment: BundleAdjustment, guess: Array | None = None, part: slice = DISTORTION
 ) -> tuple[Array, Array, float]:
-    """(g + 6,) of log focal lengths and shape, NaN where held; and the evidence that a part of the shape is no guess.
+    """Standard deviations of log focal lengths and shape, and the evidence that a part of the shape is no guess.
 
-    First from the residuals, of whose covariances the most doubtful one counts, then from what parts of the shot say.
+    Args:
+        guess: (6,) shape; None asks for no evidence.
+
+    Returns:
+        (g + 6,) from the residuals, the largest of the covariances, NaN for what is constant; (g + 6,) from leaving out
+        parts of the shot; and squared standard deviations.
     """
     groups = len(adjustment.state.log_focal)
     covariances = [*lens_covariances(adjustment), _left_out_covariance(adjustment)]
@@ -38,10 +43,11 @@ def lens_deviations(
 
 
 def lens_covariances(adjustment: BundleAdjustment) -> list[Array]:
-    """Covariance of the free ones of log focal lengths and shape, seen in several ways.
+    """Covariances of the free ones of log focal lengths and shape, each for another correlation of the errors.
 
-    Errors that are alike for a while, or in a part of the image, or as long as a track lives, count as one. How many
-    there are is seen in blocks of residuals, and in how differently the parts of the image, and the tracks, pull.
+    Errors may be correlated for a while, in a part of the image, or along a track. The first covariance is inflated by
+    the correlation within blocks of residuals; the others follow from how differently parts of the image, and tracks,
+    pull at the lens.
     """
     columns = adjustment.columns.optics.start + adjustment.free_optics
     whole = adjustment.marginals().camera
@@ -54,17 +60,16 @@ def lens_covariances(adjustment: BundleAdjustment) -> list[Array]:
 
 
 def _pulled_covariance(influence: Array, part: Index) -> Array:
-    """Covariance from how differently groups of points pull; `part`: (n,) group of each point."""
+    """Covariance from the sums of influences over groups of points; `part`: (n,) group of each point."""
     used, key = np.unique(part, return_inverse=True)
     pull = np.stack([np.bincount(key, column) for column in influence.T], -1)
     return np.asarray(pull.T @ pull * (len(used) / max(len(used) - 1, 1)))
 
 
 def _left_out_covariance(adjustment: BundleAdjustment) -> Array:
-    """Covariance as in `lens_covariances`, from where the solution goes without each part of the shot: a jackknife.
+    """Covariance as in `lens_covariances`, a jackknife: from the steps of the solution without each part of the shot.
 
-    A part that says much of the cameras draws them to itself, and its residuals hide how wrong it is; left out, it
-    cannot.
+    A part with much weight draws the cameras to itself, and its residuals hide its errors; left out, it cannot.
     """
     o = adjustment.observations
     across, down, stretches = _LEFT_OUT

@@ -25,12 +25,12 @@ logger = logging.getLogger(__name__)
 
 _CLEARLY = 0.9  # of the cost without distortion, at which the shot asks for some
 _TOLERANCE = 1e-5  # the focal length lies along a flat valley
-_OPEN_FOCAL_STD = 0.02  # like `DETERMINED_FOCAL_STD`, with what a distortion that is not believed leaves open
+_OPEN_FOCAL_STD = 0.02  # like `DETERMINED_FOCAL_STD`, where a distortion that is not believed is part of it
 _HELD_STD = 1e-6  # relative, of a focal length that is known
-_LARGEST_RATIO = 4.0  # of the focal length to its guess
+_LARGEST_RATIO = 4.0  # of the focal length to the guess
 _MISFIT = 1.5  # of the standard deviation above which a solution is doubted
-# Distortion is believed where errors hardly explain it: random ones, and those of tracks that err together, of an actor
-# without a mask above all, which look like a displacement of 1 to 4 thousandths of the width at the outermost tracks.
+# Distortion is believed where neither random errors explain it nor those of tracks that move together: an actor without
+# a mask looks like a displacement of 1 to 4 thousandths of the width at the outermost tracks.
 _LEAST_EVIDENCE = 9.0  # squared standard deviations
 _JOINT_DISPLACEMENT = 0.00125  # of the width: standard deviation
 
@@ -233,10 +233,10 @@ def _largest(std: Array, left_out: Array, groups: int) -> float:
 
 
 def _kept_focal(found: Array, std: Array, first: tuple[Array, float], *, counts: bool) -> tuple[Array, bool]:
-    """Focal lengths that the shot does not determine, (g,), and whether it has a say in them.
+    """(g,) focal lengths where the shot does not determine them, and whether the solution takes part in them.
 
-    Where it counts, and knows them better than they were known at first, they are the means of the logarithms of both,
-    each weighted by its inverse variance; else those of before.
+    Where the solution counts, and is more certain than the first guess, they are means of the logarithms of both, each
+    weighted by its inverse variance; else the first guess.
     """
     focal, first_std = first
     if not counts or float(std.max()) >= first_std:

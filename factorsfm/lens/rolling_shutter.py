@@ -1,12 +1,12 @@
 """Rolling shutter: images whose rows are read out one after another while the camera moves.
 
-A row is seen from where the camera is when that row is read. Poses are those of the image's middle; what lies above and
-below it has moved on along its own track, as the frames before and after show. The only unknown is the readout: which
-share of the time between two frames passes from the first to the last row. Rows become columns where a recorded image
-was turned upright, so both directions are tried.
+Each row is seen from where the camera is when that row is read. Poses are those of the middle row; points above and
+below it are displaced along their tracks, whose motion the frames before and after show. The only unknown is the
+readout: the share of the time between two frames that passes from the first to the last row. Rows become columns where
+a recorded image was turned upright, so both directions are tried.
 
-What shows the result over the recorded images (a renderer, a compositor, a splat) mostly knows of no rolling shutter.
-For these, each camera is fitted to its recorded image at the end, on points that are free of it.
+Most renderers and compositors that show the result over the recorded images know no rolling shutter. For them each
+camera is fitted to its recorded image at the end, on points that are free of it.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ Index = NDArray[np.int64]
 logger = logging.getLogger(__name__)
 
 _LONGEST = 1.5  # frames: the sensor has to be done before the next one, and an estimate has an error
-_LEAST_STEP = 0.03  # frames, of the first Newton step: a shorter readout is of no consequence
-_TURNING_GAIN = 10.0  # of translation, as in `Motion`, up to which a camera may only turn all the same
-_LEAST_EVIDENCE = 16.0  # squared standard deviations; tracks of an actor without a mask reach 10
-_FEWEST, _ROUNDS = 12, 4  # tracks from which an acceleration over the image is seen, and re-weightings
-_FITS = 5  # steps to the cameras of the recorded images, which are near
+_LEAST_STEP = 0.03  # frames, of the first Newton step: a shorter readout does not matter
+_TURNING_GAIN = 10.0  # of translation, as in `Motion`, below which the camera may only turn
+_LEAST_EVIDENCE = 16.0  # squared standard deviations; an actor without a mask reaches 10
+_FEWEST, _ROUNDS = 12, 4  # least number of tracks for a field of accelerations; re-weightings
+_FITS = 5  # Gauss-Newton steps to the cameras of the recorded images, which are near
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,9 +108,9 @@ def with_sweep(
 
 
 def _motion(to: Array, on: Array, time_to: int, time_on: int, place: Array) -> tuple[Array, Array]:
-    """(n, 2) motion and acceleration in an image, from the velocities to it and on from it, NaN where there is none.
+    """(n, 2) motion and acceleration in an image, from the velocities before and after it, NaN where there is none.
 
-    The acceleration is smooth over the image: that of each track by itself would hold the error of the very observation
+    The acceleration is smooth over the image: that of a single track would contain the error of the very observation
     that it is to explain. A track of a single image does not move.
     """
     change = 2.0 * (on - to) / (time_to + time_on)
@@ -123,7 +123,7 @@ def _motion(to: Array, on: Array, time_to: int, time_on: int, place: Array) -> t
 
 
 def _smooth(values: Array, place: Array) -> Array:
-    """(n, 2) values, some of them NaN, as a linear function of their places in the image, robustly; 0 for few."""
+    """Robust linear fit of values (n, 2) over the image, some of them NaN; 0 where they are too few."""
     known = np.isfinite(values[:, 0])
     if known.sum() < _FEWEST:
         return np.zeros_like(values)
@@ -147,10 +147,10 @@ def _seen(images: Sequence[MappedImage], position: int, ids: Index) -> Array:
 
 
 def find_shutter(adjustment: BundleAdjustment, motion: Motion, options: Options) -> Shutter | None:
-    """The rolling shutter where errors hardly explain what the tracks show of one.
+    """The rolling shutter, None where errors of the tracks may explain it.
 
     Args:
-        adjustment: converged with the guess, over observations with their sweep; motion: how its camera moves.
+        adjustment: converged without a shutter, over observations with their sweep; motion: of its camera.
     """
     if motion.kind is ShotKind.STATIC:
         return None
@@ -167,7 +167,7 @@ def find_shutter(adjustment: BundleAdjustment, motion: Motion, options: Options)
 def _solved_with_readout(
     adjustment: BundleAdjustment, state: State, options: Options, *, moves: bool
 ) -> BundleAdjustment | None:
-    """Converged with a readout along rows or columns, None where it is hardly any."""
+    """Converged with a readout along rows or columns, None where it is short."""
     o = adjustment.observations
     shape = shape_sigmas(options.lens, float(np.ptp(state.normalized(o), axis=0).max()))
 

@@ -1,4 +1,4 @@
-"""Where the estimate of a lens starts: fields of view, with and without distortion, scored by a few frames."""
+"""Where the estimate of a lens starts: a search over fields of view, with and without distortion, on a few frames."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ from factorsfm.support.options import PolishOptions
 
 Array = NDArray[np.float64]
 
-_FIELDS_OF_VIEW = np.radians(np.geomspace(20.0, 100.0, 8))  # across the longer side of what the tracks fill
+_FIELDS_OF_VIEW = np.radians(np.geomspace(20.0, 100.0, 8))  # across the longer side of the area that the tracks fill
 _SEARCH_FRAMES, _SEARCH_ITERATIONS, _PARABOLAS = 24, 15, 3
-_SHAPE_POWERS = np.array([2.0, 4.0, -1.0, -1.0, 0.0, 0.0])  # of the focal length in what displaces a pixel as far
+# Powers of the focal length with which a shape displaces the same pixels as far.
+_SHAPE_POWERS = np.array([2.0, 4.0, -1.0, -1.0, 0.0, 0.0])
 
 
 def search_lens(

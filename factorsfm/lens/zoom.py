@@ -1,4 +1,4 @@
-"""A zoom: the focal length of every frame, which changes smoothly over the shot."""
+"""A zoom: a focal length for every frame that changes smoothly over the shot."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ logger = logging.getLogger(__name__)
 _SHORTEST = 8  # frames in which a zoom is looked for
 _FIRST_SPREAD = 0.003  # of the acceleration of log focal length, per frame: a fast zoom by hand
 _LEAST_SPREAD = 1e-5
-# Of the mean log focal length around the guess, while the change is looked for: a turning camera says something of it,
-# of a moving one it is better held.
+# Standard deviations of the mean log focal length around the guess while the change is searched: a turning camera shows
+# the focal length, for a moving one it is better fixed.
 _TURNING_LEVEL_SIGMA, _MOVING_LEVEL_SIGMA = 0.3, 0.001
 _FLAT_ITERATIONS = 15
 _ROUNDS = 2
-_CLEARLY = 0.95  # of the cost of the start that takes no side, at which the motion of the map is preferred
-_COMPONENTS = 4  # of slow change, in which a zoom must show itself
+_CLEARLY = 0.95  # of the cost of the solution from a turning camera, below which that from the map is preferred
+_COMPONENTS = 4  # slow cosines in which a zoom must be significant
 _LEAST_EVIDENCE = 16.0  # squared standard deviations
-_LEAST_ZOOM = 0.02  # of log focal length: less is what tracks of moving things make, or focus
+_LEAST_ZOOM = 0.02  # of log focal length: moving things and focus pulls change it by less
 
 
 @dataclass(frozen=True, slots=True)
 class Zoom:
-    """A change of focal length, the focal length as a whole being a guess.
+    """A change of focal length around a mean that is still a guess.
 
     Attributes:
         found: whether the shot shows it.
@@ -158,5 +158,5 @@ def _information(times: Array, spread: float) -> Array:
 
 
 def _level(count: int, sigma: float) -> Array:
-    """Information that holds the mean."""
+    """(k, k) information of a prior on the mean."""
     return np.full((count, count), 1.0 / (count * sigma) ** 2)

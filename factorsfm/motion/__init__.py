@@ -1,4 +1,4 @@
-"""What moves: the camera, and what moves or rests in the image by itself.
+"""Motion of the camera, and tracks that do not belong to the scene.
 
 Takes observations and solutions, gives the kind of motion and tracks to leave out. May import `graph` and what
 lies below it.

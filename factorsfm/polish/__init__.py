@@ -1,4 +1,4 @@
-"""The final solve over all frames and tracks: its start, the weight of the prior, what carries each camera.
+"""The final solve over all frames and tracks: its start, the weight of the prior, observability, covariances.
 
 Takes the incremental map, gives poses, points and covariances. May import `control` and what lies below it.
 """

@@ -1,4 +1,4 @@
-"""All cameras on the longest tracks: where the polish starts, and where a bent or reversed map is recovered."""
+"""All cameras solved on the longest tracks, from several starts where the incremental map is bent or depth-reversed."""
 
 from __future__ import annotations
 
@@ -20,45 +20,45 @@ Index = NDArray[np.int64]
 
 logger = logging.getLogger(__name__)
 
-_DOUBTFUL_INFLATION = 8.0  # of blocks of the image and of time; sound solutions have 1 to 6, false ones 13 to 80
-_CLEARLY = 0.9  # of the cost of the incremental map's solution, at which another start is preferred
-_SETTLED = 0.8  # of the scale that a solution assumed, below which its errors ask for another round
-_CORE_TRACKS = 400  # tracks with which the cameras converge first
+_DOUBTFUL_INFLATION = 8.0  # see `error_inflation`; right solutions have 1 to 6, wrong ones 13 to 80
+_CLEARLY = 0.9  # of the cost of the solution from the incremental map, below which another one is preferred
+_SETTLED = 0.8  # of the assumed noise, below which the measured noise asks for another round
+_CORE_TRACKS = 400  # on which the cameras are solved first
 _CELLS, _CELL_TRACKS = (8, 5), 10  # across and down, and the tracks of each with which an unknown lens is estimated
 
 
-def start_cameras(start: State, few: Observations, options: Options) -> tuple[Index, BundleAdjustment]:
-    """All cameras on the core tracks: which points are kept, and the solution.
+def best_solution(start: State, few: Observations, options: Options) -> tuple[Index, BundleAdjustment]:
+    """All cameras on the core tracks: which points are kept, and the solution that fits best.
 
-    Residuals that are large, or alike among neighbouring tracks and frames, say that the solution is not one: the
-    incremental map may have been bent or depth-reversed beyond repair. Other starts are tried then, and the best fit
-    is kept. (A single track may well repeat its error for many frames: it slides along what it follows.)
+    Large residuals, or residuals that neighbouring tracks and frames have in common, show that a solution is wrong: the
+    incremental map may have been bent or depth-reversed beyond repair. Other starts are tried then. (The error of a
+    single track may well persist for many frames: it slides along an edge.)
     """
-    kept, best = np.arange(len(start.bearing)), converged(start, few, options)
-    rests = resting(few)
-    if rests.any():
-        others = np.nonzero(~rests)[0]
-        alone = converged(start.of(others), few.of(others), options)
-        if contradicts(best, alone, ~rests):
-            logger.info("%d of %d points rest in the image and are left out", rests.sum(), len(rests))
+    kept, best = np.arange(len(start.bearing)), solution_from(start, few, options)
+    static = resting(few)
+    if static.any():
+        others = np.nonzero(~static)[0]
+        alone = solution_from(start.of(others), few.of(others), options)
+        if contradicts(best, alone, ~static):
+            logger.info("%d of %d points do not move in the image and are left out", static.sum(), len(static))
             kept, start, few, best = others, start.of(others), alone.observations, alone
     if best.sigma > options.polish.doubtful_px or best.error_inflation() > _DOUBTFUL_INFLATION:
         logger.info("the solution does not fit (%.2f px), trying other starts", best.sigma)
-        best = _better(best, converged(_flat(start, few, options.polish), few, options))
-        best = _better(best, converged(_reversed(best.state), few, options))
+        best = _better(best, solution_from(_flat(start, few, options.polish), few, options))
+        best = _better(best, solution_from(_reversed(best.state), few, options))
     return kept, best
 
 
 def _better(known: BundleAdjustment, other: BundleAdjustment) -> BundleAdjustment:
-    """The other solution where it fits clearly better, at one scale of the errors: a median alone may be chance."""
+    """The other solution where it fits clearly better, judged with the same noise: a median alone may be chance."""
     cost, other_cost = (
         BundleAdjustment(b.state, b.observations, b.options, ErrorModel(known.sigma)).cost() for b in (known, other)
     )
     return other if other_cost < _CLEARLY * cost else known
 
 
-def converged(part: State, few: Observations, options: Options) -> BundleAdjustment:
-    """Converged from one start, first with a wide kernel."""
+def solution_from(part: State, few: Observations, options: Options) -> BundleAdjustment:
+    """Converged from one start: first with a wide kernel, then with one that fits the residuals."""
     o = options.polish
     errors = BundleAdjustment(part, few, o, ErrorModel(1.0)).reprojection_errors()
     sigma = max(FIRST_SIGMA_PX, coordinate_sigma(errors))
@@ -66,7 +66,7 @@ def converged(part: State, few: Observations, options: Options) -> BundleAdjustm
     adjustment.solve()
     iterations, measured = adjustment.iterations, coordinate_sigma(adjustment.reprojection_errors())
     while True:
-        # A wide kernel averages over outliers and lets go early: what it finds counts once the kernel fits the errors.
+        # A wide kernel averages over outliers; the solution counts once the kernel fits the residuals.
         sigma = min(sigma, measured)
         adjustment = BundleAdjustment(adjustment.state, few, o, ErrorModel(sigma))
         adjustment.solve()
@@ -78,7 +78,7 @@ def converged(part: State, few: Observations, options: Options) -> BundleAdjustm
 
 
 def _flat(part: State, few: Observations, options: PolishOptions) -> State:
-    """Rotations alone, all points at one distance: a start that takes no side."""
+    """Rotations alone, all points at one distance: a start without any shape."""
     still = replace(
         part,
         translation=np.zeros_like(part.translation),
@@ -91,21 +91,21 @@ def _flat(part: State, few: Observations, options: PolishOptions) -> State:
 
 
 def in_front(part: State) -> State:
-    """The scene before the cameras: with all inverse distances and translations negated, the images are the same."""
+    """The solution with its scene in front: negated inverse distances and translations show the same images."""
     if float(np.median(part.inverse_distance)) >= 0.0:
         return part
     return replace(part, translation=-part.translation, inverse_distance=-part.inverse_distance)
 
 
 def _reversed(part: State) -> State:
-    """Near and far exchanged and the motion turned round: in a narrow view almost the same images."""
+    """Near and far exchanged and the motion reversed: in a narrow view the images are almost the same."""
     center = float(np.median(part.inverse_distance))
     inverse = np.clip(2.0 * center - part.inverse_distance, 0.05 * center, 4.0 * center)
     return replace(part, translation=-part.translation, inverse_distance=inverse)
 
 
 def core_tracks(observations: Observations, frames: int, *, everywhere: bool = False) -> Index:
-    """Points that hold the cameras together: the longest tracks, but enough of them in every frame.
+    """Points of the longest tracks, with enough of them in every frame.
 
     Args:
         frames: how many there are; everywhere: enough of them in every part of the image, too, for the lens.
@@ -124,9 +124,9 @@ def core_tracks(observations: Observations, frames: int, *, everywhere: bool = F
 
 
 def _everywhere(observations: Observations, count: int) -> Index:
-    """Points that show the lens in every part of the image: those seen there longest.
+    """Points in every part of the image, those seen there longest, for the lens.
 
-    The longest tracks of a pan cross its middle, and say little of its rim.
+    The longest tracks of a pan cross the middle of the image and miss its rim.
     """
     o = observations
     pairs, seen = np.unique(np.stack([image_cells(o.pixels, *_CELLS), o.point], 1), axis=0, return_counts=True)

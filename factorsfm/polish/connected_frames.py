@@ -1,4 +1,4 @@
-"""Which frames hold each other: those that enough observations join to the others."""
+"""Which frames are connected: those that share enough points with the others."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Index = NDArray[np.int64]
 def connected_frames(observations: Observations, frames: int, least: int) -> tuple[NDArray[np.bool_], Index]:
     """The largest set of frames in which each observes at least so many points that others of the set observe, too.
 
-    Nothing says where the camera of another frame is, relative to these.
+    The cameras of other frames are not determined relative to these.
 
     Args:
         frames: how many there are.
@@ -34,7 +34,7 @@ def connected_frames(observations: Observations, frames: int, least: int) -> tup
 
 
 def _grown(o: Observations, part: NDArray[np.bool_], least: int) -> tuple[NDArray[np.bool_], Index]:
-    """As `connected_frames`, the set to which these frames belong: registered one after another on what it observes."""
+    """As `connected_frames`, the set that grows from some frames: others join it by the points that it observes."""
     while True:
         known = np.zeros(int(o.point.max(initial=-1)) + 1, bool)
         known[o.point[part[o.frame]]] = True

@@ -1,4 +1,4 @@
-"""What carries the pose of each camera: tracks or prior, and how far a virtual object may drift."""
+"""Observability of each camera: the share of tracks and prior in its pose, and the drift of a virtual object."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class CameraObservability:
-    """What carries the pose of a camera.
+    """The share of the prior in the pose of a camera, and the drift that its uncertainty may cause.
 
     Information is the inverse of the mean squared error: a share of 0.75 says that the same tracks without the prior
     would leave twice the error. The shares are about the camera's position relative to the scene as a whole: in the
@@ -33,8 +33,8 @@ class CameraObservability:
         prior_share_view_axis: the same of the position along the view axis, ``1 - C_zz / C0_zz``.
         triangulation_angle_deg: median over the camera's points of the largest angle between two rays of a point.
         pixel_slide: how far a virtual object may drift against the footage since the first frame because of the
-            pose's uncertainty: one standard deviation in the worst direction, pixels, of an object that rests in the
-            world in front of the image centre, at the median depth of the camera's points.
+            pose's uncertainty: one standard deviation in the worst direction, pixels, of a static object in front of
+            the image centre, at the median depth of the camera's points.
     """
 
     prior_share: float
@@ -46,7 +46,7 @@ class CameraObservability:
 def camera_observability(
     adjustment: BundleAdjustment, marginals: Marginals, covariance: Array
 ) -> list[CameraObservability]:
-    """What carries the pose of each camera of a converged problem.
+    """Observability of each camera of a converged problem.
 
     Args:
         marginals: of the problem; covariance: (c, c) of its camera side, `in_scene_unit`.
@@ -81,7 +81,7 @@ def _prior_shares(adjustment: BundleAdjustment, marginals: Marginals) -> tuple[A
 
 
 def _share(variance: Array, without: Array) -> Array:
-    """Share of the information that is missing without the prior."""
+    """Share of the information that comes from the prior."""
     return np.clip(1.0 - variance / np.maximum(without, 1e-300), 0.0, 1.0)
 
 
@@ -108,7 +108,7 @@ def triangulation_angles(state: State, observations: Observations) -> Array:
 
 
 def pixel_slide(covariance: Array, depth: Array, focal: Array | float) -> Array:
-    """Standard deviation, in its worst direction, of the image of a point that rests on the optical axis.
+    """Standard deviation, in its worst direction, of the image of a static point on the optical axis.
 
     Args:
         covariance: (k, 6, 6) of the poses; depth: (k,) of the point; focal: pixels, one or (k,).

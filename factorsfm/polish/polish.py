@@ -1,4 +1,4 @@
-"""From the incremental map to the final result: all frames and all tracks, with the prior at the weight it earns."""
+"""From the incremental map to the final result: all frames and all tracks, with the prior at its measured weight."""
 
 from __future__ import annotations
 
@@ -66,8 +66,8 @@ def polish(
         control: known poses, points and lengths; it takes part at the end, and only where the camera moves.
 
     Raises:
-        ReconstructionError: hardly any tracks are left that join frames, or what is known of the registered frames
-            leaves open where the world of the control is.
+        ReconstructionError: hardly any tracks are left that connect frames, or the control does not determine where its
+            world is.
     """
     shot = Shot.of(images, map_points, focal, shape, groups, first_focal, recording)
     start, frames, left_out = _start(shot, options, control, progress)
@@ -156,8 +156,8 @@ def _problem(
     if options.observation_sigmas is None:
         state, errors = _with_track_errors(state, start, moves, options)
         scale = errors.sigma
-    # Pixel errors that repeat themselves, from frame to frame and among neighbours, weigh less; the kernel keeps its
-    # width in pixels. What a track repeats is counted twice so: what neighbours repeat lasts longer than a stretch.
+    # Correlated errors, from frame to frame and among neighbours, weigh less; the kernel keeps its width in pixels. The
+    # persistent part of a track is counted twice by that: correlations among neighbours last longer than a stretch.
     model, options = ErrorModel(scale * wide, errors), replace(options, kernel=options.kernel / wide)
     if start.prior is None:
         return BundleAdjustment(state, start.observations, options, model, free=Free(translation=moves)), None
@@ -169,7 +169,7 @@ def _problem(
 def _with_track_errors(
     state: State, start: PolishStart, moves: bool, options: PolishOptions
 ) -> tuple[State, TrackErrors]:
-    """The tracks without the prior, and how far their errors persist, which shows where the cameras fit them all."""
+    """The state on the tracks alone, and the model of their errors, measured on these residuals."""
     adjustment = BundleAdjustment(
         state, start.observations, options, ErrorModel(start.sigma), free=Free(translation=moves)
     )

@@ -20,7 +20,7 @@ from factorsfm.lens.rolling_shutter import Shutter, find_shutter
 from factorsfm.lens.zoom import find_zoom
 from factorsfm.mapping.triangulation import Triangulation, triangulate
 from factorsfm.motion.shot_kind import Motion, classify_motion
-from factorsfm.polish.camera_starts import converged, core_tracks, start_cameras
+from factorsfm.polish.camera_starts import best_solution, core_tracks, solution_from
 from factorsfm.polish.shot import Shot
 from factorsfm.support.options import Options, PolishOptions
 from factorsfm.support.status import ShotKind
@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 _TRIANGULATION_VIEWS = 10
-_WELL_HELD = 0.3  # of the largest number of tracks in a frame
+_MANY_TRACKS = 0.3  # of the largest number of tracks in a frame
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +76,7 @@ def polish_start(
     options: Options,
     progress: Callable[[str], None],
 ) -> PolishStart:
-    """The cameras on the longest tracks, what the shot says of lens, motion and prior, and all tracks that fit it.
+    """The cameras on the longest tracks, lens, motion and the weight of the prior, and all tracks that fit.
 
     Args:
         frames: positions of the registered images; observations, tracks: theirs.
@@ -101,14 +101,14 @@ def _solved_core(shot: Shot, frames: list[int], observations: Observations, trac
     o = options.polish
     core = core_tracks(observations, len(frames), everywhere=options.estimates_lens)
     few = observations.of(core)
-    kept, adjustment = start_cameras(_first_guess(shot, frames, few, tracks[core], _world(observations)), few, options)
+    kept, adjustment = best_solution(_first_guess(shot, frames, few, tracks[core], _world(observations)), few, options)
     few = adjustment.observations
     motion, lens, shutter = None, None, None
     if few.sweep is not None:
         motion = classify_motion(adjustment, o)
         shutter = find_shutter(adjustment, motion, options)
     if shutter is not None:
-        adjustment = converged(replace(adjustment.state, lens=shutter.lens.shape), few, options)
+        adjustment = solution_from(replace(adjustment.state, lens=shutter.lens.shape), few, options)
     if options.estimates_lens:
         adjustment, lens = _estimate_lens(adjustment, frames, options, shot.first_focal)
         shutter = shutter and shutter.known_with(lens)
@@ -155,9 +155,9 @@ def _triangulated(cameras: State, observations: Observations, points: Index, fal
 
 
 def _world(observations: Observations) -> int:
-    """The first frame that the tracks hold well: from the others, the way to the solution is long."""
+    """The first frame with many tracks: as the origin of the world, it makes the way to the solution short."""
     count = np.bincount(observations.frame)
-    return int(np.argmax(count >= _WELL_HELD * count.max()))
+    return int(np.argmax(count >= _MANY_TRACKS * count.max()))
 
 
 def _estimate_lens(
@@ -202,7 +202,7 @@ def _with_fitting_tracks(
 def with_all_points(part: State, solved: State, observations: Observations, core: Index) -> State:
     """The cameras and core points of `part`, and the other points triangulated from the cameras as `solved`.
 
-    What the map said of the others is as wrong as the map was, and in another unit.
+    Their places in the map are as wrong as the map was, and in another unit.
     """
     count = int(observations.point[-1]) + 1
     bearing, inverse = np.empty((count, 3)), np.empty(count)

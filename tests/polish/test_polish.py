@@ -8,7 +8,7 @@ import pytest
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import ErrorModel
-from factorsfm.polish.camera_starts import in_front, start_cameras
+from factorsfm.polish.camera_starts import best_solution, in_front
 from factorsfm.polish.connected_frames import connected_frames
 from factorsfm.polish.polish import polish
 from factorsfm.polish.start import with_all_points
@@ -106,8 +106,8 @@ def test_a_solution_under_a_wide_kernel_is_solved_again():
     pixels = seen.pixels + wrong[:, None] * rng.normal(0.0, 5.0, seen.pixels.shape)
     seen = replace(seen, pixels=pixels)
     options = Options.preset_named("geometry")
-    _, best = start_cameras(problem.truth, seen, options)
-    _, found = start_cameras(bent(problem.truth), seen, options)
+    _, best = best_solution(problem.truth, seen, options)
+    _, found = best_solution(bent(problem.truth), seen, options)
     costs = [BundleAdjustment(b.state, seen, options.polish, ErrorModel(0.05)).cost() for b in (best, found)]
     assert costs[1] == pytest.approx(costs[0], rel=1e-4)
     assert found.sigma == pytest.approx(0.048, rel=0.05)
