@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TypeAlias
+
 import gtsam
 
 from factorsfm.graph.keyframe_graph import KeyframeGraph
 from factorsfm.graph.process import GraphProcess
 
-LiveGraph = tuple[gtsam.NonlinearFactorGraph, gtsam.Values]
+Factors: TypeAlias = gtsam.NonlinearFactorGraph
+Values: TypeAlias = gtsam.Values
+LiveGraph = tuple[Factors, Values]
 
 
 def empty_graph() -> LiveGraph:

@@ -223,6 +223,25 @@ def projection_factor(
     return gtsam.GenericProjectionFactorCal3_S2(pixels, noise, pose_key, point_key, lens)
 
 
+def lens_projection_factor(
+    pixels: Array, noise: gtsam.noiseModel.Base, pose_key: int, point_key: int, lens_key: int
+) -> gtsam.GeneralSFMFactor2Cal3_S2:
+    """The same residual with the lens as a variable, too."""
+    return gtsam.GeneralSFMFactor2Cal3_S2(pixels, noise, pose_key, point_key, lens_key)
+
+
+def lens_of(focal: float) -> gtsam.Cal3_S2:
+    """A lens without distortion, the principal point at 0."""
+    return gtsam.Cal3_S2(focal, focal, 0.0, 0.0, 0.0)
+
+
+def lens_prior(key: int, focal: float, sigma: float) -> gtsam.PriorFactorCal3_S2:
+    """Prior of a lens around one focal length for both axes, `sigma` in pixels; the rest is pinned."""
+    covariance = np.diag(np.full(5, 1e-6) ** 2)
+    covariance[:2, :2] += sigma**2
+    return gtsam.PriorFactorCal3_S2(key, lens_of(focal), gtsam.noiseModel.Gaussian.Covariance(covariance))
+
+
 def constant_projection_factor(
     camera: gtsam.PinholePoseCal3_S2, pixels: Array, noise: gtsam.noiseModel.Base, point_key: int
 ) -> gtsam.TriangulationFactorPoseCal3_S2:

@@ -10,7 +10,7 @@ Mask = NDArray[np.bool_]
 
 
 class Slots:
-    """Slots of the factors of one kind, each named by a keyframe's position and a track."""
+    """Slots of the factors of one kind, each named by a keyframe and a track."""
 
     def __init__(self, keyframe: Index | None = None, track: Index | None = None, slot: Index | None = None) -> None:
         none = np.zeros(0, np.int64)

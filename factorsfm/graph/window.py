@@ -22,7 +22,7 @@ class DepthMeasurements:
         image: (p,) rows of the keyframes that carry a prior; scale, shift: (p,) affines of these, as far as known.
         row: (d,) which of these each value belongs to; point: (d,) row of its landmark.
         inverse_depth: (d,) values; sigma: (d,) standard deviations, in units of the prior.
-        scale_sigma, shift_sigma: how well every affine is known beforehand, around 1 and 0.
+        scale_sigma, shift_sigma: how well every affine is known beforehand, around 1 (times `Window.unit`) and 0.
     """
 
     image: Index
@@ -41,16 +41,20 @@ class Window:
     """Keyframes and landmarks with their present values, and the measurements that join them.
 
     Attributes:
-        positions: (k,) position of each keyframe in the shot, ascending; constant: (k,) which poses do not change.
+        keyframes: (k,) index of the frame of each in its source, the newest last; constant: (k,) which poses do not
+            change.
         rotation (k, 3, 3), translation (k, 3): `cam_from_world`.
         ids: (n,) tracks, ascending; points: (n, 3) landmarks in the world.
         frame, point: (m,) rows of the keyframe and of the landmark of each observation.
         pixels: (m, 2) undistorted observations, pixels relative to the principal point.
         focal: pixels; sigma: standard deviation of an observation, pixels.
         depths: of the prior, or None.
+        unknown_lens: whether the focal length is a variable; open_lens: whether it may be estimated now.
+        unit: how many times as long lengths are as when the map began; unit_held: whether factors of the caller
+            determine it.
     """
 
-    positions: Index
+    keyframes: Index
     constant: Mask
     rotation: Array
     translation: Array
@@ -62,11 +66,15 @@ class Window:
     focal: float
     sigma: float
     depths: DepthMeasurements | None = None
+    unknown_lens: bool = False
+    open_lens: bool = False
+    unit: float = 1.0
+    unit_held: bool = False
 
     @property
     def solved(self) -> Mask:
         """(k,) keyframes whose poses are solved for: neither constant nor, where none is constant, the world."""
-        first = np.arange(len(self.positions)) == 0
+        first = np.arange(len(self.keyframes)) == 0
         return np.asarray(~self.constant & ~(first & (not self.constant.any())))
 
     def reprojection(self) -> tuple[Array, Array]:

@@ -29,18 +29,24 @@ _LARGEST_SIGMA_PX = 3.0
 _DEPTH_SIGMA = 0.6  # relative error of a network at a landmark, its smooth part included, as it usually is
 
 
-def taking_part(keyframes: list[MappedImage]) -> tuple[list[MappedImage], list[MappedImage]]:
-    """Those before the newest ones that share most with the last, and the newest ones, in order of time."""
+def taking_part(keyframes: list[MappedImage], named: set[int]) -> tuple[list[MappedImage], list[MappedImage]]:
+    """Those before the newest ones that share most with the last, and the newest ones, in order of time.
+
+    Args:
+        named: frames that take part in any case, since factors of the caller name them.
+    """
     free = keyframes[-_FREE_KEYFRAMES:]
     before = keyframes[: -len(free)]
     shared = np.array([shared_tracks(image.tracks, keyframes[-1].tracks) for image in before], np.int64)
-    chosen = np.sort(np.argsort(-shared, kind="stable")[:_HELD_KEYFRAMES])
+    held = np.array([image.tracks.frame in named for image in before], bool)
+    rank = np.argsort(-shared, kind="stable")
+    chosen = np.union1d(rank[:_HELD_KEYFRAMES], np.flatnonzero(held))
     return [before[k] for k in chosen], free
 
 
-def choose_window(keyframes: list[MappedImage]) -> tuple[list[MappedImage], NDArray[np.bool_]]:
-    """The keyframes that take part, in order of time, and which of them are constant."""
-    before, free = taking_part(keyframes)
+def choose_window(keyframes: list[MappedImage], named: set[int]) -> tuple[list[MappedImage], NDArray[np.bool_]]:
+    """The keyframes that take part, in order of time, and which of them are constant; `named` as in `taking_part`."""
+    before, free = taking_part(keyframes, named)
     window = [image for image in before if shared_tracks(image.tracks, free[-1].tracks) >= _LEAST_SHARED] + free
     constant = np.arange(len(window)) < len(window) - len(free)
     if before:
@@ -48,16 +54,19 @@ def choose_window(keyframes: list[MappedImage]) -> tuple[list[MappedImage], NDAr
     return window, constant
 
 
-def choose_landmarks(images: list[MappedImage], ids: Index) -> tuple[Index, Index]:
+def choose_landmarks(images: list[MappedImage], ids: Index, named: set[int]) -> tuple[Index, Index]:
     """Landmarks that become variables of the graph, and points that are solved alone, with the new poses.
 
-    In the graph are those that the newest keyframe sees, and of the others those that most keyframes see.
+    In the graph are those that factors of the caller name, those that the newest keyframe sees, and of the others those
+    that most keyframes see.
     """
     room = _MOST_LANDMARKS
     if len(ids) <= room:
         return ids, ids[:0]
     seen = np.sum([np.isin(ids, image.tracks.ids) for image in images], axis=0)
-    rank = np.argsort(-(seen + len(images) * np.isin(ids, images[-1].tracks.ids)), kind="stable")
+    most = len(images) + 1
+    first = most * np.isin(ids, images[-1].tracks.ids) + 2 * most * np.isin(ids, sorted(named))
+    rank = np.argsort(-(seen + first), kind="stable")
     inside = np.zeros(len(ids), bool)
     inside[rank[:room]] = True
     return ids[inside], ids[~inside]
@@ -79,7 +88,7 @@ def measured_window(
     tracks = [image.tracks for image in images]
     observations = gather(tracks, ids, focal)
     window = Window(
-        positions=np.array([image.position for image in tracks]),
+        keyframes=np.array([image.frame for image in tracks]),
         constant=constant,
         rotation=np.array([image.rotation for image in images]),
         translation=np.array([image.translation for image in images]),

@@ -99,7 +99,7 @@ def solve_alone(
         image.rotation, image.translation = update.poses.get(position, image.pose)
         image.affine = update.affines.get(position, image.affine)
     affine, prior = guidance.at_observations(moved, ids)
-    state = state_of(moved, copy.points.at(ids), copy.focal)
+    state = state_of(moved, copy.points.at(ids), update.focal or copy.focal)
     if affine is not None:
         state = replace(state, scale=affine[:, 0], shift=affine[:, 1], field=np.zeros(1))
     alone = BundleAdjustment(

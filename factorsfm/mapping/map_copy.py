@@ -8,8 +8,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.graph.added_factors import NOTHING_ADDED, AddedFactors
 from factorsfm.mapping.graph_window import taking_part
-from factorsfm.mapping.mapped_images import MappedImage
+from factorsfm.mapping.mapped_images import MappedImage, scaled
 from factorsfm.mapping.point_map import PointMap
 from factorsfm.priors.image_depth import ImageDepth
 from factorsfm.support.options import MapperOptions
@@ -30,6 +31,9 @@ class MapUpdate:
         focal: a better focal length (pixels), None where it stays as it is.
         burn_ins: tracks of what is laid over the images.
         mirrored: see `UpdateResult`.
+        unit: how many times as long lengths are now, all others of the map included.
+        added: the caller's factors as the next update needs them; offered: how many of those that waited were tried;
+            refused: why these were not taken.
         no_prior: whether the keyframes show that the depth prior is none; `reason` says why.
     """
 
@@ -47,6 +51,10 @@ class MapUpdate:
     burn_ins: Index = field(default_factory=lambda: np.zeros(0, np.int64))
     mirrored: bool = False
     no_prior: bool = False
+    unit: float = 1.0
+    added: AddedFactors | None = None
+    offered: int = 0
+    refused: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +64,8 @@ class MapCopy:
     Attributes:
         keyframes: in order of time, the new one last.
         focal: pixels; refine_focal: whether it is a guess.
+        added: the caller's factors that the graph has taken; offered: those that wait.
+        unit: how many times as long lengths are as when the map began; unit_held: whether the factors determine it.
     """
 
     keyframes: list[MappedImage]
@@ -63,6 +73,10 @@ class MapCopy:
     options: MapperOptions
     focal: float
     refine_focal: bool = False
+    added: AddedFactors = NOTHING_ADDED
+    offered: tuple[AddedFactors, ...] = ()
+    unit: float = 1.0
+    unit_held: bool = False
 
     @property
     def newest(self) -> MappedImage:
@@ -79,9 +93,23 @@ class MapCopy:
         bare = [replace(image, tracks=replace(image.tracks, depth=None)) for image in self.keyframes]
         return replace(self, keyframes=bare)
 
+    def scaled(self, unit: float, added: AddedFactors, *, unit_held: bool) -> MapCopy:
+        """An independent copy with all lengths `unit` times as long, and all of the caller's factors as taken."""
+        keyframes = [scaled(image, unit) for image in self.keyframes]
+        return replace(
+            self, keyframes=keyframes, points=self.points.scaled(unit), added=added, offered=(),
+            unit=self.unit * unit, unit_held=unit_held,
+        )  # fmt: skip
+
+    @property
+    def named_frames(self) -> set[int]:
+        """The keyframes that the caller's factors name."""
+        return self.added.frames.union(*(added.frames for added in self.offered))
+
     def needed(self) -> MapCopy:
         """As much of it as makes a difference to an update, which does not grow with the length of the shot."""
-        before, free = taking_part(self.keyframes)
+        before, free = taking_part(self.keyframes, self.named_frames)
         keyframes = before + free
-        points = self.points.part(np.concatenate([image.tracks.ids for image in keyframes]))
+        named = np.array(sorted(self.added.tracks.union(*(added.tracks for added in self.offered))), np.int64)
+        points = self.points.part(np.unique(np.concatenate([named, *(image.tracks.ids for image in keyframes)])))
         return replace(self, keyframes=keyframes, points=points)

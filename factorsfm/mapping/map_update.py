@@ -15,11 +15,15 @@ from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import ErrorModel, Free
 from factorsfm.adjustment.state import State
-from factorsfm.graph.keyframe_graph import YOUNG, KeyframeGraph, UpdateResult
+from factorsfm.graph.added_factors import on_window
+from factorsfm.graph.keyframe_graph import KeyframeGraph, UpdateResult
+from factorsfm.graph.live_isam import YOUNG
+from factorsfm.graph.unit_of_length import unit_of_length
 from factorsfm.graph.window import Window
 from factorsfm.mapping.depth_fallback import DepthGuidance
 from factorsfm.mapping.graph_window import choose_landmarks, choose_window, measured_window
 from factorsfm.mapping.landmarks import add_landmarks, mapped_landmarks, solve_alone
+from factorsfm.mapping.map_contents import MapContents
 from factorsfm.mapping.map_copy import MapCopy, MapUpdate
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.mapping.prior_check import inconsistency
@@ -38,15 +42,40 @@ _TRIAL_ITERATIONS = 5  # that tell whether what rests is at odds with the others
 _SOLVER = replace(PolishOptions(), tolerance=1e-3)
 _COVARIANCE_INFLATION = 20.0  # the errors of neighbouring tracks are correlated: so many tracks count as one
 _LENS_KEYFRAMES = 6  # from which an unknown focal length is estimated
-_LENS_ITERATIONS = 6
-_LENS_STD = 0.01  # relative, with which an estimate is better than a guess; a young map can be wrong as a whole
 _LENS_SIGMA_PX = 0.3  # standard deviation of the errors above which what they say of the lens is chance
-_LARGEST_LENS_STEP = 0.5  # of the logarithm of the focal length
+_SIGNIFICANT, _LEAST_CHANGE = 3.0, 0.005  # standard deviations, and logarithm, of a change of the unit of length
 _FARTHEST = 1e-6  # smallest inverse distance of a point
 
 
 def update_map(copy: MapCopy, graph: KeyframeGraph) -> MapUpdate:
-    """New landmarks, and what the graph makes of all keyframes around the new one."""
+    """New landmarks, and what the graph makes of all keyframes around the new one.
+
+    Factors that the caller offers are taken as a whole, or refused where the update fails with them alone.
+    """
+    if len(copy.keyframes) == 1 or not (copy.offered or copy.added.numbers):
+        return _extended(copy, graph)
+    trial = _with_offered(copy)
+    update = replace(_extended(trial, graph), unit=trial.unit / copy.unit, offered=len(copy.offered))
+    if update.committed or not copy.offered:
+        return update
+    without = _extended(_with_offered(replace(copy, offered=())), graph)
+    if not without.committed:
+        return without
+    return replace(without, offered=len(copy.offered), refused=f"the factors added are refused: {update.reason}")
+
+
+def _with_offered(copy: MapCopy) -> MapCopy:
+    """The map with all that is offered, in the unit of length that the factors determine."""
+    added = copy.added
+    for offered in copy.offered:
+        added = added.joined(offered)
+    unit, std = unit_of_length(added, MapContents(copy.keyframes, copy.points))
+    if not copy.offered or abs(np.log(unit)) < max(_SIGNIFICANT * std, _LEAST_CHANGE):
+        unit = 1.0
+    return copy.scaled(unit, added, unit_held=bool(np.isfinite(std)))
+
+
+def _extended(copy: MapCopy, graph: KeyframeGraph) -> MapUpdate:
     o, newest = copy.options, copy.newest
     position, depth = newest.tracks.position, newest.tracks.depth
     if o.graph_depth and len(copy.keyframes) <= YOUNG_KEYFRAMES and (reason := inconsistency(copy.keyframes)):
@@ -56,40 +85,58 @@ def update_map(copy: MapCopy, graph: KeyframeGraph) -> MapUpdate:
     affine = {position: newest.affine} if newest.affine is not None else {}
     if len(copy.keyframes) == 1:
         return MapUpdate(position, depth, True, "the first keyframe", affines=affine)
-    images, constant = choose_window(copy.keyframes)
+    images, constant = choose_window(copy.keyframes, copy.named_frames)
     add_landmarks(copy, images, guidance)
     ids = mapped_landmarks(images, copy.points)
     if (seen := int(np.isin(newest.tracks.ids, ids).sum())) < o.min_inliers:
         return MapUpdate(position, depth, False, f"{seen} of {o.min_inliers} needed landmarks in the keyframe")
     # A young map has the shape that the prior guessed, and far to go; it is also cheap.
     iterations = max(o.graph_iterations, _YOUNG_ITERATIONS // len(copy.keyframes))
-    ids, others = choose_landmarks(images, ids)
-    result = graph.update(measured_window(images, constant, ids, copy.points, copy.focal, o), iterations)
+    ids, others = choose_landmarks(images, ids, copy.added.tracks)
+    result = _solved(copy, graph, images, constant, ids, iterations)
     burn_ins = removed = _burn_ins(copy, images, constant, result.window)
     if len(burn_ins):
         kept = _lifted_anew(copy, images, np.setdiff1d(ids, burn_ins))
         removed, ids = np.setdiff1d(ids, kept), kept
-        result = graph.update(measured_window(images, constant, ids, copy.points, copy.focal, o), _YOUNG_ITERATIONS)
+        result = _solved(copy, graph, images, constant, ids, _YOUNG_ITERATIONS)
     if not result.committed:
         return MapUpdate(position, depth, False, result.reason, mirrored=result.mirrored)
-    focal, window = None, result.window
-    if copy.refine_focal and len(copy.keyframes) >= _LENS_KEYFRAMES:
-        focal, window = _better_focal(window)
-    update = _judged(copy, images, window, result, focal)
+    update = _judged(copy, images, result)
     if len(others):
         update = solve_alone(copy, images, update, others, guidance)
     return replace(update, removed=np.union1d(update.removed, removed), burn_ins=burn_ins) if len(burn_ins) else update
 
 
-def _adjustment(window: Window, *, focal: bool = False) -> BundleAdjustment:
+def _solved(
+    copy: MapCopy,
+    graph: KeyframeGraph,
+    images: list[MappedImage],
+    constant: NDArray[np.bool_],
+    ids: Index,
+    iterations: int,
+) -> UpdateResult:
+    """What the graph makes of some keyframes and landmarks, as the copy has them now."""
+    window = measured_window(images, constant, ids, copy.points, copy.focal, copy.options)
+    window = replace(
+        window,
+        unknown_lens=copy.refine_focal,
+        open_lens=copy.refine_focal and len(copy.keyframes) >= _LENS_KEYFRAMES and window.sigma <= _LENS_SIGMA_PX,
+        unit=copy.unit,
+        unit_held=copy.unit_held,
+    )
+    added, constants = on_window(copy.added, window, MapContents(copy.keyframes, copy.points))
+    return graph.update(window, iterations, added, constants)
+
+
+def _adjustment(window: Window) -> BundleAdjustment:
     """The landmarks and keyframes of a window without the prior, as a problem of the batch solver."""
     distance = np.linalg.norm(window.points, axis=1)
     state = State(
         window.rotation, window.translation, window.points / distance[:, None], 1.0 / distance, np.log([window.focal])
     )
     observations = Observations(window.frame, window.point, window.pixels)
-    free = Free(focal=focal, held=~window.solved)
-    return BundleAdjustment(state, observations, _SOLVER, ErrorModel(window.sigma), free=free)
+    held = Free(held=~window.solved)
+    return BundleAdjustment(state, observations, _SOLVER, ErrorModel(window.sigma), free=held)
 
 
 def _burn_ins(copy: MapCopy, images: list[MappedImage], constant: NDArray[np.bool_], window: Window) -> Index:
@@ -135,27 +182,10 @@ def _lifted_anew(copy: MapCopy, window: list[MappedImage], ids: Index) -> Index:
     return first.ids[good]
 
 
-def _better_focal(window: Window) -> tuple[float | None, Window]:
-    """Solve for the focal length, too; None where the map does not determine it yet, or fits no focal length."""
-    if window.sigma > _LENS_SIGMA_PX:
-        return None, window
-    free = _adjustment(window, focal=True)
-    state = free.solve(_LENS_ITERATIONS)
-    focal = free.columns.log_focal
-    variance = _COVARIANCE_INFLATION * float(free.marginals().camera[focal, focal].item())
-    if variance > _LENS_STD**2 or abs(state.log_focal - np.log(window.focal))[0] > _LARGEST_LENS_STEP:
-        return None, window
-    return float(np.exp(state.log_focal[0])), replace(
-        window, rotation=state.rotation, translation=state.translation, points=state.points
-    )
-
-
-def _judged(
-    copy: MapCopy, images: list[MappedImage], window: Window, result: UpdateResult, focal: float | None
-) -> MapUpdate:
+def _judged(copy: MapCopy, images: list[MappedImage], result: UpdateResult) -> MapUpdate:
     """The solution as the map takes it over, and what in it does not fit."""
-    unit = _unit(images, window)
-    window = window.scaled(unit)
+    unit = _unit(images, result.window)
+    window = result.window.scaled(unit)
     solved = np.flatnonzero(window.solved).tolist()
     poses = {images[row].tracks.position: (window.rotation[row], window.translation[row]) for row in solved}
     affines = {}
@@ -163,7 +193,10 @@ def _judged(
         guided = [images[row].tracks.position for row in d.image]
         affines = dict(zip(guided, zip(d.scale.tolist(), d.shift.tolist(), strict=True), strict=True))
     units = np.array([1.0, 1.0, 1.0, unit, unit, unit])
-    covariances = {p: _COVARIANCE_INFLATION * c * np.outer(units, units) for p, c in result.covariance.items()}
+    position = {image.tracks.frame: image.tracks.position for image in images}
+    covariances = {
+        position[k]: _COVARIANCE_INFLATION * c * np.outer(units, units) for k, c in result.covariance.items()
+    }
     errors, depth = window.reprojection()
     limit = _GROSS * max(copy.options.inlier_px, 5.0 * float(np.median(errors)))
     count = np.bincount(window.point, minlength=len(window.ids))
@@ -171,8 +204,9 @@ def _judged(
     behind = np.bincount(window.point, depth < _FARTHEST, len(window.ids)) > 0.5 * count
     good = (typical < limit) & ~behind
     return MapUpdate(
-        window.positions[-1].item(), images[-1].tracks.depth, True, result.reason,
-        window.ids[good], window.points[good], window.ids[~good], poses, affines, covariances, focal,
+        images[-1].tracks.position, images[-1].tracks.depth, True, result.reason,
+        window.ids[good], window.points[good], window.ids[~good], poses, affines, covariances,
+        window.focal if window.focal != copy.focal else None, added=result.added,
     )  # fmt: skip
 
 
@@ -182,7 +216,8 @@ def _unit(images: list[MappedImage], window: Window) -> float:
     1 where the unit is not free: the graph holds it, or a prior that knows its zero does.
     """
     depths = [image.tracks.depth for image in images if image.tracks.depth is not None]
-    if len(images) > YOUNG or window.constant.any() or any(not depth.free_shift for depth in depths):
+    held = window.unit_held or window.constant.any() or any(not depth.free_shift for depth in depths)
+    if len(images) > YOUNG or held:
         return 1.0
     before = np.array([image.pose[1] for image in images])  # the first camera is the world
     lengths = np.linalg.norm(before, axis=1).sum(), np.linalg.norm(window.translation, axis=1).sum()

@@ -67,6 +67,19 @@ def state_of(images: Sequence[MappedImage], points: Array, focal: float) -> Stat
     )
 
 
+def scaled(image: MappedImage, unit: float) -> MappedImage:
+    """An image, registered or not, in a world where all lengths are `unit` times as long."""
+    image = replace(image)
+    if image.translation is not None:
+        image.translation = unit * image.translation
+    if image.affine is not None:
+        image.affine = unit * image.affine[0], image.affine[1]
+    if image.covariance is not None:
+        units = np.repeat([1.0, unit], 3)
+        image.covariance = image.covariance * np.outer(units, units)
+    return image
+
+
 def refocus(images: Sequence[MappedImage], ratio: float) -> None:
     """Give the images, which may share cameras, `ratio` times their present focal lengths."""
     cameras = {id(image.tracks.camera): image.tracks.camera for image in images}

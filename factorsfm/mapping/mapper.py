@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from factorsfm.graph.contents import LiveGraph, graph_contents
 from factorsfm.graph.process import GraphProcess
+from factorsfm.mapping.additions import Additions
 from factorsfm.mapping.graph_updates import submit_update
 from factorsfm.mapping.incremental import IncrementalMapper
 from factorsfm.mapping.keyframes import carry, is_keyframe
@@ -22,7 +23,7 @@ from factorsfm.mapping.live_covariance import live_covariance
 from factorsfm.mapping.map_copy import MapCopy, MapUpdate
 from factorsfm.mapping.map_registration import register_by_corners
 from factorsfm.mapping.map_update import YOUNG_KEYFRAMES
-from factorsfm.mapping.mapped_images import MappedImage
+from factorsfm.mapping.mapped_images import MappedImage, scaled
 from factorsfm.mapping.point_map import PointMap
 from factorsfm.mapping.prior_trust import PriorTrust
 from factorsfm.mapping.registration import Registration
@@ -40,7 +41,7 @@ Index = NDArray[np.int64]
 logger = logging.getLogger(__name__)
 
 _STATE = (
-    "focal", "first_focal", "keyframes", "new_points", "parallax", "started", "_due",
+    "focal", "first_focal", "keyframes", "new_points", "parallax", "started", "unit", "_due",
 )  # fmt: skip
 _RUNNING_OUT = 0.5  # share of an image's tracks with a point, below which the map is extended at once
 _SETTLED, _SETTLED_DELAY = 5, 2  # keyframes of a map that changes little; frames that it waits longer for the graph
@@ -65,6 +66,8 @@ class Mapper(IncrementalMapper):
         self.new_points = 0  # that came with the last image
         self.parallax = 0.0  # largest so far
         self.note = ""  # what became of the map with the last image, where that is out of the ordinary
+        self.unit = 1.0  # how many times as long lengths are as when the map began
+        self.additions = Additions()
         self.starts_anew = False  # whether the map was given up with the last image
         self._graph = graph
         self._update: Future[MapUpdate] | None = None
@@ -88,6 +91,7 @@ class Mapper(IncrementalMapper):
             "prior": [self._prior.lost, self._prior.mirrored, self._prior.missing],
             "images": list(self.images),
             "points": self.points.table,
+            "additions": self.additions.state(),
             "update": update,
         }
 
@@ -99,6 +103,7 @@ class Mapper(IncrementalMapper):
         self._prior = PriorTrust(self._prior.wanted, *state["prior"])
         self.images = list(state["images"])
         self.points = PointMap(state["points"])
+        self.additions.restore(state["additions"])
         if state["update"] is not None:
             self._update = Future()
             self._update.set_result(state["update"])
@@ -177,6 +182,14 @@ class Mapper(IncrementalMapper):
         self.refresh()
         self._take_up_lost()
         self.close()
+
+    def add_factors(self, graph: object, values: object) -> None:
+        """Let the next update of the graph take factors of the caller; errors as in `checked_factors`."""
+        self.additions.offer(graph, values, self._keyframes_with_new(), self.points)
+
+    def _keyframes_with_new(self) -> list[MappedImage]:
+        """Those of the map, and the one that the graph is working on."""
+        return [image for image in self.images if image.keyframe]
 
     def graph(self) -> LiveGraph:
         """A copy of the keyframe graph as the last update left it, empty before the first one."""
@@ -271,6 +284,9 @@ class Mapper(IncrementalMapper):
     def _give_up_map(self, reason: str) -> None:
         self._graph.start_anew()
         self.points, self.keyframes, self.parallax, self.started = PointMap(), [], 0.0, False
+        if self.additions.taken or self.additions.offered:
+            reason += "; the factors added are given up with it"
+        self.additions, self.unit = Additions(), 1.0
         self.starts_anew, self.note = True, reason
         logger.warning(reason)
 
@@ -337,7 +353,10 @@ class Mapper(IncrementalMapper):
     def _add_keyframe(self, image: MappedImage, read_depth: Callable[[], ImageDepth | None] | None) -> None:
         """Let the graph work on the keyframe; the map takes over its result after `graph_delay` frames."""
         keyframes = [replace(self.images[k]) for k in self.keyframes] + [replace(image)]
-        copy = MapCopy(keyframes, self.points.copy(), self.options, self.focal, self._refine_focal)
+        copy = MapCopy(
+            keyframes, self.points.copy(), self.options, self.focal, self._refine_focal,
+            added=self.additions.active, offered=tuple(self.additions.offered), unit=self.unit,
+        )  # fmt: skip
         if self._prior.lost:
             copy = copy.without_prior()
         read = read_depth if self._prior.active else None
@@ -367,6 +386,9 @@ class Mapper(IncrementalMapper):
             image.keyframe = False
             return
         self.keyframes.append(update.position)
+        self.note = self.additions.follow(update) or self.note
+        if update.unit != 1.0:
+            self._rescale(update.unit)
         before = image.pose
         self.new_points += int((~self.points.contains(update.ids)).sum())
         self.points.set(update.ids, update.points)
@@ -381,6 +403,15 @@ class Mapper(IncrementalMapper):
         carry(image, before, self.images[update.position + 1 :])
         if update.focal is not None:
             self._set_focal(update.focal)
+
+    def _rescale(self, unit: float) -> None:
+        """Go on with all lengths `unit` times as long."""
+        self.unit *= unit
+        self.points = self.points.scaled(unit)
+        for image in self.images:
+            rescaled = scaled(image, unit)
+            image.translation, image.affine = rescaled.translation, rescaled.affine
+            image.covariance = rescaled.covariance
 
     @property
     def without_prior(self) -> str:

@@ -46,6 +46,10 @@ class PointMap:
         """An independent copy."""
         return PointMap(self._points)
 
+    def scaled(self, unit: float) -> PointMap:
+        """An independent copy with all lengths `unit` times as long."""
+        return PointMap(unit * self._points)
+
     def part(self, ids: Index) -> PointMap:
         """An independent copy that holds no other tracks than these."""
         ids = ids[self.contains(ids)]

@@ -19,7 +19,7 @@ from factorsfm.camera.guess import guess_camera
 from factorsfm.control.known import Control
 from factorsfm.frames.frame import Frame, as_frame
 from factorsfm.frames.texture import BLANK_TEXTURE
-from factorsfm.graph.contents import LiveGraph, empty_graph
+from factorsfm.graph.contents import Factors, LiveGraph, Values, empty_graph
 from factorsfm.graph.process import GraphProcess
 from factorsfm.lens.camera_model import distortion_of
 from factorsfm.mapping.mapper import Mapper
@@ -95,6 +95,7 @@ class Stream(Closing):
         self._size = (0, 0)
         self._colors = TrackColors()
         self._without_depth: dict[int, str] = {}  # why the prior failed, by the frame's index
+        self._taken: set[int] = set()  # indices that name the variables of frames
 
     def push(self, frame: Frame | NDArray[np.uint8], *, keyframe: bool = False) -> FrameUpdate:
         """Take the next frame.
@@ -127,7 +128,9 @@ class Stream(Closing):
         with self.seconds.of("mapping"):
             mapper.advance()
         focal_changed |= self._follow_focal(mapper)
-        tracks = ImageTracks(len(self.frames), tracked.ids, tracked.xy, self.camera)
+        tracks = ImageTracks(
+            len(self.frames), tracked.ids, tracked.xy, self.camera, index=self._free_index(frame.index)
+        )
         tracks = tracks.of(tracks.invertible & (tracked.texture >= BLANK_TEXTURE))  # a blank image's tracks are noise
         with self.seconds.of("mapping"):
             image = mapper.add(tracks, lambda: self._read_depth(frame, tracks.pixels), keyframe=keyframe)
@@ -157,10 +160,44 @@ class Stream(Closing):
         """A copy of the live factor graph, and its values; both empty before the second keyframe.
 
         Waits for the update that the graph is working on. Keys are GTSAM's symbols: ``X(i)`` the pose
-        (`world_from_cam`) of frame number i of this stream, counted from 0, where that is a keyframe; ``L(j)`` the
-        landmark of track j; ``A(i)`` scale and shift of the depth map of frame i (`graph.factors.affine_of_native`).
+        (`world_from_cam`) of the frame with index i, where that is a keyframe (`keyframes`); ``L(j)`` the landmark of
+        track j; ``A(i)`` scale and shift of the depth map of frame i (`graph.factors.affine_of_native`); ``K(0)`` the
+        lens where it is not known. An index that came twice counts on from the largest one.
         """
         return self._mapper.graph() if self._mapper is not None else empty_graph()
+
+    def add_factors(self, graph: Factors, values: Values) -> None:
+        """Add factors of your own to the live graph; the update of the next keyframe takes all of them, or none.
+
+        Factors name the poses ``X(i)`` and affines ``A(i)`` of `keyframes`, landmarks ``L(j)`` of the map, and
+        variables of your own with any other letter. They are in the world of the stream: that of its first keyframe,
+        whose pose stays. Where they determine the unit of length, all lengths follow (`FrameUpdate.note` says so), and
+        the result is in that unit, too. They take part in `finish`, and go with `save`.
+
+        Args:
+            graph: GTSAM's factors in C++, which can be serialised.
+            values: of the variables of your own that no earlier factor has named.
+
+        Raises:
+            InputError: a factor cannot be taken (Python callback, unknown key, key that is in use, variables that are
+                left open), or the stream has control or no map yet. Where the images contradict the factors only the
+                update finds out: `FrameUpdate.note` then says that they are refused.
+        """
+        if self.control is not None:
+            raise InputError("a stream with control takes no factors; say of the control what the factors would")
+        if self._mapper is None or not self._mapper.started:
+            raise InputError("there is no map yet to which factors could be added")
+        self._mapper.add_factors(graph, values)
+
+    @property
+    def keyframes(self) -> dict[int, float | None]:
+        """Timestamps (seconds, None if unknown) of the keyframes of the map, by the index i of ``X(i)``."""
+        images = self._mapper.images if self._mapper is not None else []
+        return {
+            image.tracks.frame: frame.timestamp
+            for image, frame in zip(images, self.frames, strict=True)
+            if image.keyframe
+        }
 
     @property
     def points(self) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
@@ -226,6 +263,7 @@ class Stream(Closing):
             setattr(self, name, state[name])
         self.seconds.update(state["seconds"])
         self.frames = [SeenFrame(*frame) for frame in state["frames"]]
+        self._taken = {image.tracks.frame for image in state["mapper"]["images"]} if state["mapper"] else set()
         self._tracker.restore(state["tracker"])
         self._finder = ViewFinder(self._tracker, state["views"], state["next_view"])
         self._colors = TrackColors(state["colors"])
@@ -307,6 +345,13 @@ class Stream(Closing):
         self._held.enter_context(OneThreadEach())
         focal = 0.5 * (self.camera.focal_length_x + self.camera.focal_length_y)
         return Mapper(self._graph, focal, self._size[0], self.options, has_prior=self._depth is not None)
+
+    def _free_index(self, index: int) -> int:
+        """The index that names a frame's variables: its own, or the next free one where another frame has that."""
+        if index in self._taken or index < 0:
+            index = max(self._taken, default=-1) + 1
+        self._taken.add(index)
+        return index
 
     def _read_depth(self, frame: Frame, xy: NDArray[np.float64]) -> ImageDepth | None:
         """The prior at keypoints; once there is a map, a frame on which it fails goes without."""

@@ -22,11 +22,12 @@ class ImageTracks:
     """The measurements of one image: its tracks, and the depth prior at them where it has one.
 
     Attributes:
-        position: index among the frames seen.
+        position: index among the images seen.
         ids: (n,) identities of the tracks, ascending.
         pixels: (n, 2) keypoints, in pixels of the camera with centres at integers.
         camera: of the image; another focal length is another camera, the pixels stay.
         depth: prior at the n keypoints.
+        index: of the frame in its source, which names its variables in the graph; None: the position.
     """
 
     position: int
@@ -34,6 +35,12 @@ class ImageTracks:
     pixels: Array
     camera: pycolmap.Camera
     depth: ImageDepth | None = None
+    index: int | None = None
+
+    @property
+    def frame(self) -> int:
+        """Index of the frame in its source."""
+        return self.position if self.index is None else self.index
 
     @cached_property
     def xy(self) -> Array:

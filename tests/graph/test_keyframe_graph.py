@@ -18,9 +18,10 @@ from factorsfm.adjustment.gather import gather
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import ErrorModel, Free
 from factorsfm.adjustment.state import State
-from factorsfm.graph import keyframe_graph
+from factorsfm.graph import live_isam
 from factorsfm.graph.factors import camera_from_pose
-from factorsfm.graph.keyframe_graph import YOUNG, KeyframeGraph
+from factorsfm.graph.keyframe_graph import KeyframeGraph
+from factorsfm.graph.live_isam import YOUNG, LiveIsam
 from factorsfm.graph.window import DepthMeasurements, Window
 from factorsfm.priors.affine import SCALE_SIGMA, SHIFT_SIGMA
 from factorsfm.support.options import MapperOptions, PolishOptions
@@ -61,7 +62,7 @@ class Shot:
             ids = np.arange(len(self.points) if max(frames) >= 2 else self.half)
         o = gather([image.tracks for image in images], ids, self.problem.focal)
         return Window(
-            positions=np.array(list(frames)),
+            keyframes=np.array(list(frames)),
             constant=np.arange(len(images)) < constant,
             rotation=np.array([image.rotation for image in images]),
             translation=np.array([image.translation for image in images]),
@@ -141,7 +142,7 @@ def state_of(window):
 def errors(shot):
     """Largest error of a rotation (radians) and of a translation, median relative error of the points."""
     truth, state = shot.problem.truth, in_unit_of(state_of(shot.solved), shot.problem.truth)
-    at = shot.solved.positions
+    at = shot.solved.keyframes
     depth = np.linalg.norm(state.points - shot.problem.points, axis=1) * truth.inverse_distance
     shift = np.linalg.norm(state.translation - truth.translation[at], axis=1)
     return np.array([angles_between(state.rotation, truth.rotation[at]).max(), shift.max(), np.median(depth)])
@@ -354,7 +355,7 @@ def depth_factors(shot):
 
 @pytest.mark.parametrize("most", [100, 10])
 def test_every_landmark_has_a_depth_and_every_keyframe_some(most, monkeypatch):
-    monkeypatch.setattr(keyframe_graph, "_DEPTHS", most)
+    monkeypatch.setattr(live_isam, "_DEPTHS", most)
     shot = Shot("handheld", frames=5).run()
     keyframe, track = depth_factors(shot).T
     assert set(track) == set(range(len(shot.points)))
@@ -364,7 +365,7 @@ def test_every_landmark_has_a_depth_and_every_keyframe_some(most, monkeypatch):
 
 
 def test_landmarks_that_lose_their_only_depth_get_another(monkeypatch):
-    monkeypatch.setattr(keyframe_graph, "_DEPTHS", 10)
+    monkeypatch.setattr(live_isam, "_DEPTHS", 10)
     shot = Shot("handheld", frames=12)
     for k in range(1, 12):
         assert shot.update(range(max(0, k - 6), k + 1), constant=2 if k > 6 else 0).committed
@@ -523,15 +524,15 @@ def test_a_bad_first_update_is_rolled_back():
 
 def fail(monkeypatch, times, error):
     """Let the first trials raise; the number of trials so far."""
-    trials, update = [], keyframe_graph._Live.update
+    trials, update = [], LiveIsam.update
 
-    def failing(self, window, iterations):
+    def failing(self, *arguments):
         trials.append(self)
         if len(trials) <= times:
             raise error
-        return update(self, window, iterations)
+        return update(self, *arguments)
 
-    monkeypatch.setattr(keyframe_graph._Live, "update", failing)
+    monkeypatch.setattr(LiveIsam, "update", failing)
     return trials
 
 
@@ -566,7 +567,7 @@ def test_a_solver_that_fails_is_no_update(monkeypatch, error):
 
 def test_a_position_can_be_taken_only_once():
     shot = Shot("truck", guided=()).run(2)
-    window = replace(shot.window(range(3)), positions=np.array([0, 1, 1]))
+    window = replace(shot.window(range(3)), keyframes=np.array([0, 1, 1]))
     result = shot.graph.update(window, 3)
     assert not result.committed
     assert "already exists" in result.reason

@@ -34,7 +34,7 @@ def map_of(points):
 
 def test_few_landmarks_are_all_in_the_graph():
     ids = np.arange(900)
-    inside, outside = choose_landmarks([image_of(0, ids), image_of(1, ids)], ids)
+    inside, outside = choose_landmarks([image_of(0, ids), image_of(1, ids)], ids, set())
     np.testing.assert_array_equal(inside, ids)
     assert len(outside) == 0
 
@@ -42,14 +42,14 @@ def test_few_landmarks_are_all_in_the_graph():
 def test_of_many_landmarks_the_newest_keyframe_s_come_first_and_then_what_most_keyframes_see():
     ids = np.arange(1300)
     seen = [ids, ids[:1000], ids[:800], ids[1200:]]  # the newest keyframe sees what hardly any other does
-    inside, outside = choose_landmarks([image_of(k, mine) for k, mine in enumerate(seen)], ids)
+    inside, outside = choose_landmarks([image_of(k, mine) for k, mine in enumerate(seen)], ids, set())
     np.testing.assert_array_equal(inside, np.r_[ids[:800], ids[1200:]])
     np.testing.assert_array_equal(outside, ids[800:1200])
 
 
 def test_of_too_many_in_the_newest_keyframe_those_with_most_views_are_in_the_graph():
     ids = np.arange(1000)
-    inside, outside = choose_landmarks([image_of(0, ids[100:]), image_of(1, ids)], ids)
+    inside, outside = choose_landmarks([image_of(0, ids[100:]), image_of(1, ids)], ids, set())
     np.testing.assert_array_equal(inside, ids[100:])
     np.testing.assert_array_equal(outside, ids[:100])
 
@@ -148,7 +148,7 @@ def test_a_window_has_the_observations_and_the_prior_of_its_landmarks():
     np.testing.assert_array_equal(d.shift, [0.0, 0.3])
     assert len(d.inverse_depth) == 2 * len(ids)
     depth = np.array(
-        [problem.depth(window.positions[d.image[r]], [ids[p]])[0] for r, p in zip(d.row, d.point, strict=True)]
+        [problem.depth(window.keyframes[d.image[r]], [ids[p]])[0] for r, p in zip(d.row, d.point, strict=True)]
     )
     np.testing.assert_allclose(d.inverse_depth, 1.2 / depth + 0.1)
     np.testing.assert_allclose(d.sigma, 0.6 * np.sqrt(2) * d.scale[d.row])  # two images repeat the same error

@@ -24,18 +24,18 @@ class Recorder(KeyframeGraph):
 
     window = None
 
-    def update(self, window, iterations):
+    def update(self, window, iterations, *added):
         self.window, self.iterations = window, iterations
-        return super().update(window, iterations)
+        return super().update(window, iterations, *added)
 
     @property
-    def positions(self):
-        return self.window.positions.tolist()
+    def keyframes(self):
+        return self.window.keyframes.tolist()
 
     @property
     def guided(self):
         depths = self.window.depths
-        return [] if depths is None else self.window.positions[depths.image].tolist()
+        return [] if depths is None else self.window.keyframes[depths.image].tolist()
 
 
 def map_of(points, ids=None):
@@ -75,7 +75,7 @@ def test_a_young_map_is_solved_for_as_a_whole():
     problem, images, points = handheld()
     update = update_map(copy_of(problem, images, map_of(points)), graph := Recorder())
     assert update.committed
-    assert graph.positions == list(range(6))
+    assert graph.keyframes == list(range(6))
     assert not graph.window.constant.any()  # the first one is the world
     assert graph.guided == []
     assert len(graph.window.ids) == len(points)
@@ -99,7 +99,7 @@ def test_of_a_long_shot_the_newest_keyframes_and_the_constant_ones_that_share_mo
     update = update_map(copy_of(problem, images, map_of(problem.points)), graph := Recorder())
     assert update.committed
     # The tenth shares too few, and of the nine others the last one shares the fewest.
-    assert graph.positions == list(range(8)) + list(range(10, 26))
+    assert graph.keyframes == list(range(8)) + list(range(10, 26))
     assert graph.window.constant.tolist() == 8 * [True] + 16 * [False]
     assert list(update.poses) == list(update.covariances) == list(range(10, 26))
 
@@ -109,7 +109,7 @@ def test_without_a_constant_keyframe_the_oldest_two_of_the_window_are_constant()
     for image in images[:10]:
         image.tracks = image.tracks.of(image.tracks.ids < 29)
     update = update_map(copy_of(problem, images, map_of(problem.points)), graph := Recorder())
-    assert graph.positions == list(range(10, 26))
+    assert graph.keyframes == list(range(10, 26))
     assert graph.window.constant.tolist() == 2 * [True] + 14 * [False]
     assert list(update.poses) == list(range(12, 26))
 

@@ -1,0 +1,64 @@
+"""Factors that the caller adds to the graph of a map: from when they are offered until the last frame."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from factorsfm.graph.added_factors import NOTHING_ADDED, AddedFactors
+from factorsfm.graph.factor_checks import checked_factors
+from factorsfm.mapping.map_contents import MapContents
+from factorsfm.mapping.map_copy import MapUpdate
+from factorsfm.mapping.mapped_images import MappedImage
+from factorsfm.mapping.point_map import PointMap
+
+logger = logging.getLogger(__name__)
+
+
+class Additions:
+    """What the caller has added to the graph of one map.
+
+    Attributes:
+        taken: the factors that the graph has taken, as they were given; offered: those that wait for an update.
+        active: what an update needs of them: those on its window, and what the others have become.
+    """
+
+    def __init__(self) -> None:
+        self.taken: list[AddedFactors] = []
+        self.offered: list[AddedFactors] = []
+        self.active = NOTHING_ADDED
+        self._following = 0  # number of the next factor
+
+    def state(self) -> dict[str, Any]:
+        """Everything that `restore` needs."""
+        return {
+            "taken": self.taken, "offered": self.offered, "active": self.active, "following": self._following,
+        }  # fmt: skip
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go on where `state` was taken."""
+        self.taken, self.offered = list(state["taken"]), list(state["offered"])
+        self.active, self._following = state["active"], state["following"]
+
+    def offer(self, graph: object, values: object, keyframes: Sequence[MappedImage], points: PointMap) -> None:
+        """Check factors, and let the next update take them; errors as in `checked_factors`."""
+        earlier = [self.active, *self.offered, *self.taken]
+        added = checked_factors(graph, values, MapContents(keyframes, points), earlier, self._following)
+        self._following += len(added.numbers)
+        self.offered.append(added)
+
+    def follow(self, update: MapUpdate) -> str:
+        """Take over what an update made of the factors; a sentence where that is out of the ordinary."""
+        if not update.committed or update.added is None:
+            return ""
+        offered, self.offered = self.offered[: update.offered], self.offered[update.offered :]
+        self.active = update.added
+        self._following = max([self._following, *(number + 1 for number in update.added.numbers)])
+        if update.refused:
+            logger.warning(update.refused)
+            return update.refused
+        self.taken += offered
+        if update.unit == 1.0:
+            return ""
+        return f"the factors added set the unit of length: lengths are now {update.unit:.4g} times as long"
