@@ -35,6 +35,8 @@ class ControlFit:
             that of its first camera.
         scale_std: relative standard deviation of the scene's size in the control's unit.
         position_std: standard deviation of a camera's position in this world and unit, median over the cameras.
+        source: "control", or "factors" where the caller added them to the live graph; the world is then that of the
+            live map.
     """
 
     residuals: list[ControlResidual]
@@ -43,3 +45,4 @@ class ControlFit:
     placed: bool
     scale_std: float
     position_std: float
+    source: str = "control"

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,13 +43,13 @@ class Controlled:
 
     Attributes:
         adjustment: at its minimum, in the world of the polish.
-        world_alignment: from that to the world of the control.
+        world_alignment: from that to the world of the control; None where this has no unit of its own.
         covariance: (k, 6, 6) of the poses in the control's world, in the polish's unit of length.
         camera_covariance: (c, c) of the camera side relative to the scene's unit.
     """
 
     adjustment: BundleAdjustment
-    world_alignment: Similarity
+    world_alignment: Similarity | None
     covariance: Array
     marginals: Marginals
     camera_covariance: Array
@@ -83,7 +85,15 @@ def solve_under_control(
             "control: it contradicts the images so much that the scene shrinks to a point; "
             f"{worst.name} is then off by {worst.sigmas:.0f} sigma"
         )
-    return _described(solved, term, control)
+    residuals = _residuals(term, solved.state)
+    logger.info("control: %d items, %d contradict", len(residuals), sum(r.contradicts for r in residuals))
+    exact = [control.names[row] for row, _ in control.held]
+    return described(
+        solved, term,
+        lambda scale_std, position_std: ControlFit(
+            residuals, exact, control.unused, control.placed, scale_std, position_std
+        ),
+    )  # fmt: skip
 
 
 def frames_under_control(registered: list[int], control: LocatedControl, limit: int) -> list[int]:
@@ -117,25 +127,28 @@ def _converged(
 # --- the result -------------------------------------------------------------------------------------------------
 
 
-def _described(solved: BundleAdjustment, term: ControlTerm, control: SolvedControl) -> Controlled:
-    """The solution with its covariances and residuals."""
+class AlignedTerm(Protocol):
+    """A term that aligns the world of the polish with one of its own."""
+
+    def aligned(self, state: State) -> AlignedState: ...
+
+
+def described(solved: BundleAdjustment, term: AlignedTerm, fit: Callable[[float, float], ControlFit]) -> Controlled:
+    """The solution with its covariances.
+
+    Args:
+        fit: of the relative standard deviation of the scale and that of a camera's position.
+    """
     state, marginals = solved.state, solved.marginals()
     aligned = term.aligned(state)
     relative = in_scene_unit(marginals, state, _by_size(aligned))
     covariance = _pose_covariance(marginals, aligned)
     log_scale = Columns.of(state).control.start + 6
     spread = aligned.scale * np.sqrt(np.trace(covariance[:, 3:, 3:], axis1=1, axis2=2))
-    residuals = _residuals(term, state)
-    logger.info("control: %d items, %d contradict", len(residuals), sum(r.contradicts for r in residuals))
-    fit = ControlFit(
-        residuals,
-        [control.names[row] for row, _ in control.held],
-        control.unused,
-        control.placed,
-        float(np.sqrt(max(float(relative[log_scale, log_scale]), 0.0))),
-        float(np.median(spread)),
+    scale_std = float(np.sqrt(max(float(relative[log_scale, log_scale]), 0.0)))
+    return Controlled(
+        solved, aligned.similarity, covariance, marginals, relative, fit(scale_std, float(np.median(spread)))
     )
-    return Controlled(solved, aligned.similarity, covariance, marginals, relative, fit)
 
 
 def _residuals(term: ControlTerm, state: State) -> list[ControlResidual]:

@@ -53,7 +53,7 @@ class SolvedControl:
             if key not in rows:
                 self.unused.append(f"frame {key} is not registered, or not among those that are solved together")
         seen = np.bincount(marks.point, minlength=len(control.points))
-        self.places = _triangulated(state, marks, seen)
+        self.places = triangulated(state, marks, seen)
         ends: dict[str, Place] = {}
         self.usable = np.zeros(len(seen), bool)
         for row, point in enumerate(control.points):
@@ -106,7 +106,7 @@ def rotation_of(pose: KnownPose) -> Array:
     return np.asarray(pycolmap.Rotation3d(np.asarray(pose.cam_from_world, np.float64)).matrix())
 
 
-def _triangulated(state: State, marks: Observations, seen: Index) -> Array:
+def triangulated(state: State, marks: Observations, seen: Index) -> Array:
     """(p, 3) points that two frames see, in the world of the solution; NaN for the others."""
     places = np.full((len(seen), 3), np.nan)
     several = np.nonzero(seen >= 2)[0]

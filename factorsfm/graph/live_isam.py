@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -62,6 +63,7 @@ class LiveIsam:
         self._held: set[int] = set()  # keys of the variables that are constant
         self._added: dict[int, int] = {}  # slot by the number of the caller's factor
         self._own: set[int] = set()  # keys of the caller's variables
+        self._constant_poses: dict[int, gtsam.Pose3] = {}  # of the constant keyframes, by index
         self._size: int | None = None  # slot of the distance that holds the unit of length
         self._landmark_sigma = landmark_sigma
         self._focal = self._sigma = self._unit = 0.0
@@ -74,6 +76,7 @@ class LiveIsam:
         copy._projections, copy._constants = self._projections.copy(), self._constants.copy()
         copy._depths, copy._priors = self._depths.copy(), dict(self._priors)
         copy._held, copy._added, copy._own = set(self._held), dict(self._added), set(self._own)
+        copy._constant_poses = dict(self._constant_poses)
         copy._size, copy._focal, copy._sigma, copy._unit = self._size, self._focal, self._sigma, self._unit
         copy.free_lens = self.free_lens
         return copy
@@ -250,8 +253,8 @@ class LiveIsam:
             row: pose_from_camera(window.rotation[row], window.translation[row])
             for row in np.flatnonzero(window.constant)
         }
-        cameras = {int(window.keyframes[row]): gtsam.PinholePoseCal3_S2(pose, lens) for row, pose in poses.items()}
-
+        self._constant_poses = {int(window.keyframes[row]): pose for row, pose in poses.items()}
+        cameras = {i: gtsam.PinholePoseCal3_S2(pose, lens) for i, pose in self._constant_poses.items()}
         if window.unknown_lens:
             constant = np.zeros_like(constant)
 
@@ -331,12 +334,27 @@ class LiveIsam:
         return replace(window, rotation=rotation, translation=translation, points=points, depths=depths, focal=focal)
 
     def contents(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-        """A copy of the factors, and the estimate."""
-        slots, graph = self._isam.getFactorsUnsafe(), gtsam.NonlinearFactorGraph()
+        """A copy of the factors, and the estimate, constant keyframes among the variables.
+
+        GTSAM has no text for the factors of constant cameras: the copy has the same projections on held poses.
+        """
+        slots, graph, values = self._isam.getFactorsUnsafe(), gtsam.NonlinearFactorGraph(), self.estimate()
+        seen = dict(zip(self._constants.slot.tolist(), self._constants.keyframe.tolist(), strict=True))
+        lens = lens_of(self._focal)
+        for keyframe in sorted(set(seen.values())):
+            if not values.exists(key := X(keyframe)):
+                values.insert(key, self._constant_poses[keyframe])
+                graph.add(held_prior(key, values))
         for slot in range(slots.size()):
-            if slots.exists(slot):
-                graph.add(slots.at(slot))
-        return graph, self._isam.calculateEstimate()
+            if not slots.exists(slot):
+                continue
+            factor = slots.at(slot)
+            if slot in seen:
+                landmark = factor.keys()[0]
+                constant: Any = factor
+                factor = projection_factor(constant.measured(), constant.noiseModel(), X(seen[slot]), landmark, lens)
+            graph.add(factor)
+        return graph, values
 
     def estimate(self) -> gtsam.Values:
         """Of all variables."""

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from factorsfm.graph.added_factors import NOTHING_ADDED, AddedFactors
 from factorsfm.graph.factor_checks import checked_factors
 from factorsfm.mapping.map_contents import MapContents
 from factorsfm.mapping.map_copy import MapUpdate
-from factorsfm.mapping.mapped_images import MappedImage
-from factorsfm.mapping.point_map import PointMap
 
 logger = logging.getLogger(__name__)
 
@@ -41,12 +39,19 @@ class Additions:
         self.taken, self.offered = list(state["taken"]), list(state["offered"])
         self.active, self._following = state["active"], state["following"]
 
-    def offer(self, graph: object, values: object, keyframes: Sequence[MappedImage], points: PointMap) -> None:
+    def offer(self, graph: object, values: object, contents: MapContents) -> None:
         """Check factors, and let the next update take them; errors as in `checked_factors`."""
         earlier = [self.active, *self.offered, *self.taken]
-        added = checked_factors(graph, values, MapContents(keyframes, points), earlier, self._following)
+        added = checked_factors(graph, values, contents, earlier, self._following)
         self._following += len(added.numbers)
         self.offered.append(added)
+
+    def everything(self) -> AddedFactors:
+        """All factors, as they were given, those included that wait."""
+        added = NOTHING_ADDED
+        for batch in (*self.taken, *self.offered):
+            added = added.joined(batch)
+        return added
 
     def follow(self, update: MapUpdate) -> str:
         """Take over what an update made of the factors; a sentence where that is out of the ordinary."""

@@ -14,12 +14,14 @@ from numpy.typing import NDArray
 
 from factorsfm.graph.contents import LiveGraph, graph_contents
 from factorsfm.graph.process import GraphProcess
+from factorsfm.graph.unit_of_length import unit_of_length
 from factorsfm.mapping.additions import Additions
 from factorsfm.mapping.graph_updates import submit_update
 from factorsfm.mapping.incremental import IncrementalMapper
 from factorsfm.mapping.keyframes import carry, is_keyframe
 from factorsfm.mapping.landmarks import add_tracks
 from factorsfm.mapping.live_covariance import live_covariance
+from factorsfm.mapping.map_contents import MapContents
 from factorsfm.mapping.map_copy import MapCopy, MapUpdate
 from factorsfm.mapping.map_registration import register_by_corners
 from factorsfm.mapping.map_update import YOUNG_KEYFRAMES
@@ -179,17 +181,20 @@ class Mapper(IncrementalMapper):
         self._take_over()
         if not self.started:
             self._begin(self._starter.last_resort(self._waiting(), self.focal))
+        if self.additions.offered:  # no update will take them: the polish does
+            self._rescale(unit_of_length(self.additions.everything(), self.contents())[0])
         self.refresh()
         self._take_up_lost()
         self.close()
 
     def add_factors(self, graph: object, values: object) -> None:
         """Let the next update of the graph take factors of the caller; errors as in `checked_factors`."""
-        self.additions.offer(graph, values, self._keyframes_with_new(), self.points)
+        keyframes = [image for image in self.images if image.keyframe]  # and the one that the graph is working on
+        self.additions.offer(graph, values, MapContents(keyframes, self.points))
 
-    def _keyframes_with_new(self) -> list[MappedImage]:
-        """Those of the map, and the one that the graph is working on."""
-        return [image for image in self.images if image.keyframe]
+    def contents(self) -> MapContents:
+        """Poses, affines and landmarks by frame and track."""
+        return MapContents(self.images, self.points)
 
     def graph(self) -> LiveGraph:
         """A copy of the keyframe graph as the last update left it, empty before the first one."""

@@ -19,7 +19,8 @@ from factorsfm.adjustment.residuals import cauchy
 from factorsfm.adjustment.state import State
 from factorsfm.adjustment.track_errors import TrackErrors, measure_track_errors
 from factorsfm.control.known import LocatedControl
-from factorsfm.control.solve import frames_under_control, solve_under_control
+from factorsfm.control.solve import Controlled, frames_under_control, solve_under_control
+from factorsfm.control.with_factors import ShotFactors, solve_with_factors
 from factorsfm.lens.rolling_shutter import Recording, seen_at_once
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.polish.connected_frames import connected_frames
@@ -49,6 +50,7 @@ def polish(
     shape: Array | None = None,
     groups: Index | None = None,
     control: LocatedControl | None = None,
+    factors: ShotFactors | None = None,
     first_focal: tuple[Array, float] | None = None,
     recording: Recording | None = None,
 ) -> Polished:
@@ -64,19 +66,25 @@ def polish(
         recording: of which the images are all, if their rows may have been read one after another; None: all at once,
             or in no order of time.
         control: known poses, points and lengths; it takes part at the end, and only where the camera moves.
+        factors: of the caller, where there is no control; they take part as it does.
 
     Raises:
         ReconstructionError: hardly any tracks are left that connect frames, or the control does not determine where its
             world is.
     """
     shot = Shot.of(images, map_points, focal, shape, groups, first_focal, recording)
-    start, frames, left_out = _start(shot, options, control, progress)
+    named = _named(shot, control, factors, options.polish.max_frames // 2)
+    start, frames, left_out = _start(shot, options, named, progress)
     progress("polish: all tracks")
     adjustment, result = _solved(shot, start, frames, left_out, options.polish)
     if control is not None and start.motion.kind is ShotKind.GENERAL:
         progress("polish: control")
         _put_under_control(result, adjustment, control, shot)
-    result.control_unused = control is not None and result.control is None
+    if factors is not None and start.motion.kind is ShotKind.GENERAL:
+        progress("polish: factors")
+        _respect_factors(result, adjustment, factors, shot)
+    if result.control is None and (control is not None or factors is not None):
+        result.unused = "Control" if control is not None else "Factors added"
     registered = [position for position in shot.registered if position not in left_out]
     if len(frames) < len(registered):
         progress("polish: frames between")
@@ -90,9 +98,12 @@ def polish(
 
 
 def _start(
-    shot: Shot, options: Options, control: LocatedControl | None, progress: Callable[[str], None]
+    shot: Shot, options: Options, named: Callable[[list[int]], list[int]], progress: Callable[[str], None]
 ) -> tuple[PolishStart, list[int], dict[int, str]]:
     """Where the solution starts, the positions of its frames, and why others are left out.
+
+    Args:
+        named: gives those of some frames that must be solved for, since something is known of them.
 
     A frame of which hardly any track is left among those that fit the cameras is not determined: all is done again
     without it.
@@ -107,8 +118,7 @@ def _start(
                 "frames, at least 2 needed"
             )
         frames = solved_frames(shot.images, registered, o.max_frames)
-        if control is not None:
-            frames = sorted({*frames, *frames_under_control(registered, control, o.max_frames // 2)})
+        frames = sorted({*frames, *named(registered)})
         tracks = shot.long_tracks(frames, min(o.min_track_length, max(2, len(frames))))
         observations = shot.observations(frames, tracks)
         unconnected = _unconnected(observations, frames, least)
@@ -119,6 +129,18 @@ def _start(
             return start, frames, left_out
         logger.info("left out of the polish, too few tracks: images %s", sorted(unconnected))
         left_out.update(unconnected)
+
+
+def _named(
+    shot: Shot, control: LocatedControl | None, factors: ShotFactors | None, limit: int
+) -> Callable[[list[int]], list[int]]:
+    """Which of some registered frames control or factors name; of very many, some."""
+    if control is not None:
+        return lambda registered: frames_under_control(registered, control, limit)
+    names = factors.frames if factors is not None else []
+    if len(names) > limit:
+        names = [names[k] for k in np.linspace(0, len(names) - 1, limit).astype(int)]
+    return lambda registered: sorted({*names} & {*registered})
 
 
 def _unconnected(observations: Observations, frames: list[int], least: int) -> dict[int, str]:
@@ -185,7 +207,16 @@ def _with_track_errors(
 def _put_under_control(result: Polished, adjustment: BundleAdjustment, control: LocatedControl, shot: Shot) -> None:
     """Everything as it is with the control; the observability stays that of images and prior."""
     marks = shot.marks(control.marks, result.frames, len(control.control.points))
-    found = solve_under_control(adjustment, control, marks, result.frames)
+    _take_over(result, solve_under_control(adjustment, control, marks, result.frames))
+
+
+def _respect_factors(result: Polished, adjustment: BundleAdjustment, factors: ShotFactors, shot: Shot) -> None:
+    """Everything as it is with the factors; the observability stays that of images and prior."""
+    marks = shot.observations(result.frames, factors.tracks)
+    _take_over(result, solve_with_factors(adjustment, factors, marks, result.frames))
+
+
+def _take_over(result: Polished, found: Controlled) -> None:
     result.state, result.errors = found.adjustment.state, found.adjustment.reprojection_errors()
     result.covariance, result.world_alignment, result.control = found.covariance, found.world_alignment, found.fit
     result.point_std = found.marginals.inverse_distance_std(found.camera_covariance)

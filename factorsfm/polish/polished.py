@@ -37,7 +37,7 @@ class Polished:
         shutter: a rolling shutter, None where the shot shows none; recorded: whether poses are those of cameras without
             one, fitted to the recorded images, see `Options.shutter`.
         world_alignment: from this world to that of the control; control: its residuals. None without control.
-        control_unused: whether there is control that could not take part.
+        unused: "Control" or "Factors added", where there are some that could not take part.
     """
 
     frames: list[int]
@@ -57,7 +57,7 @@ class Polished:
     recorded: bool = False
     world_alignment: Similarity | None = None
     control: ControlFit | None = None
-    control_unused: bool = False
+    unused: str = ""
 
     def describe_prior(self, adjustment: BundleAdjustment, camera_covariance: Array) -> None:
         """Take over what a solution says of the prior: its residuals, and how certain its scales and shifts are.

@@ -37,8 +37,10 @@ def result_notes(
         notes.append(lens_note(polished.lens))
     if polished.control is not None:
         notes += control_notes(polished.control)
-    if polished.control_unused:
-        notes.append("Control: not used, since a camera that stays in its place ties no lengths to the images.")
+    if polished.unused:
+        notes.append(
+            f"{polished.unused}: not used, since a camera that stays in its place ties no lengths to the images."
+        )
     if depth_given and not has_depth:
         notes.append("The depth prior took no part: no frame that needed it has a usable depth map.")
     if guessed is not None:
@@ -127,15 +129,19 @@ def control_notes(fit: ControlFit) -> list[str]:
     good = [r.sigmas for r in fit.residuals if not r.contradicts]
     size = f", off by {np.sqrt(np.mean(np.square(good))):.2g} sigma (root mean square)" if good else ""
     held = f"{len(fit.held)} poses held exactly, " if fit.held else ""
-    world = "The result is in the control's world." if fit.placed else "The world is that of the first camera."
+    what, item, world = "Control", "items of the control", "The world is that of the first camera."
+    if fit.source == "factors":
+        what, item, world = "Factors added", "factors", "The result is in the world of the live graph."
+    elif fit.placed:
+        world = "The result is in the control's world."
     notes = [
-        f"Control: {held}{len(good)} items used{size}; the scale is known to {100 * fit.scale_std:.2g} %, the position "
+        f"{what}: {held}{len(good)} items used{size}; the scale is known to {100 * fit.scale_std:.2g} %, the position "
         f"of a camera to {fit.position_std:.2g} m. {world}"
     ]
     if wrong:
         worst = sorted(wrong, key=lambda r: -r.sigmas)[:3]
         said = "; ".join(f"{r.name} by {r.error:.3g} {r.unit} or {r.sigmas:.0f} sigma" for r in worst)
-        notes.append(f"{len(wrong)} items of the control contradict the images and the other items: {said}.")
+        notes.append(f"{len(wrong)} {item} contradict the images and the others: {said}.")
     if fit.unused:
         notes.append(f"Not used of the control: {'; '.join(fit.unused[:3])}.")
     return notes

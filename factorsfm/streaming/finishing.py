@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from factorsfm.camera.guess import first_focal_std
 from factorsfm.control.known import Control, LocatedControl, locate
+from factorsfm.control.with_factors import ShotFactors
+from factorsfm.graph.factors_on_poses import FactorsOnPoses
 from factorsfm.lens.camera_model import distortion_of
 from factorsfm.lens.rolling_shutter import Recording
 from factorsfm.mapping.mapper import Mapper
@@ -89,6 +91,7 @@ class EndedShot:
             lambda stage: progress(stage, 0, None) if progress else None,
             distortion_of(self.camera) if self.options.estimates_lens else None,
             control=control,
+            factors=self._factors(),
             first_focal=(np.array([self.mapper.first_focal]), first_focal_std(self.camera, given=self.lens_given)),
             recording=self._recording(),
         )
@@ -99,6 +102,22 @@ class EndedShot:
         if shutter == "global" or (shutter == "auto" and self.control is not None):
             return None
         return Recording(self.camera.width, self.camera.height, np.array([frame.index for frame in self.frames]))
+
+    def _factors(self) -> ShotFactors | None:
+        """Those that were added to the live graph, with the poses that these are beside."""
+        added, contents = self.mapper.additions.everything(), self.mapper.contents()
+        if not added.numbers:
+            return None
+        images = [image for image in self.mapper.images if image.registered]
+        frame_of = {image.tracks.position: image.tracks.frame for image in images}
+        return ShotFactors(
+            frames=[position for position, frame in frame_of.items() if frame in added.frames],
+            tracks=np.array(sorted(added.tracks), np.int64),
+            poses={image.tracks.position: image.pose for image in images},
+            on_poses=lambda positions, tracks: FactorsOnPoses(
+                added, contents, [frame_of[position] for position in positions], tracks
+            ),
+        )
 
     def _located_control(self) -> LocatedControl | None:
         if self.control is None:

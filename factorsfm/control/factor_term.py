@@ -1,0 +1,114 @@
+"""Factors of the caller as a term of the polish: on its poses, and on landmarks that are variables of their own.
+
+The factors are in the world of the live map. The alignment from the world of the polish to that, and the landmarks that
+the factors name, are `State.control` as in `residuals`. The alignment passes through the first camera; its rotation is
+free about the axes that the factors know something of, as of gravity, and its scale where they know lengths.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorsfm.adjustment.state import State
+from factorsfm.control.residuals import ALIGNMENT, AlignedState, ControlTerm, MarkItem, Place
+
+Array = NDArray[np.float64]
+
+_TURN_STD, _SCALE_STD = 0.05, 0.3  # radians, and of the logarithm: from where on the factors know something of it
+_HELD = 1e12  # information of what is held
+
+
+class PoseFactors(Protocol):
+    """Factors as a function of poses and landmarks (`graph.factors_on_poses`)."""
+
+    def cost(self, rotation: Array, translation: Array, points: Array) -> float: ...
+    def quadratic(self, rotation: Array, translation: Array, points: Array) -> tuple[Array, Array]: ...
+    def errors(self, rotation: Array, translation: Array, points: Array) -> list[tuple[str, float]]: ...
+
+
+class FactorTerm:
+    """The factors, and the observations of their landmarks, as a term of `BundleAdjustment`.
+
+    Args:
+        factors: on all poses of the state, and on the landmarks in the order of `State.control`.
+        marks: observations of these landmarks.
+        start: (3, 3) rotation of the alignment; anchor: (3,) its place, see `AlignedState`.
+        kernel: of the observations, standard deviations.
+
+    Attributes:
+        free: (7 + 3 p,) which variables are estimated; determines_scale: whether the factors know lengths.
+    """
+
+    def __init__(
+        self, factors: PoseFactors, marks: Sequence[MarkItem], start: Array, anchor: Array, kernel: float, state: State
+    ) -> None:
+        self._factors = factors
+        self._marks = ControlTerm(marks, start, anchor, np.ones(len(state.control), bool), kernel)
+        self._held = np.zeros((3, 3))
+        information, _ = self._quadratic(state)
+        first = self.aligned(state).first
+        size = 1.0 / max(float(information[first + 6, first + 6]), 1e-300)
+        self.determines_scale = bool(size < _SCALE_STD**2)
+        known, axes = np.linalg.eigh(information[first : first + 3, first : first + 3])
+        held = axes[:, known < _TURN_STD**-2.0]
+        self._held = _HELD * held @ held.T
+        self.free = np.ones(len(state.control), bool)
+        self.free[:3] = held.shape[1] < 3
+        self.free[3:6] = False
+        self.free[6] = self.determines_scale
+
+    def aligned(self, state: State) -> AlignedState:
+        """A state with the alignment to the world of the factors."""
+        return self._marks.aligned(state)
+
+    def cost(self, state: State) -> float:
+        """Cost of the factors and of the observations of their landmarks."""
+        turn = state.control[:3]
+        held = 0.5 * float(turn @ self._held @ turn)
+        return self._factors.cost(*self._in_factors_world(state)) + self._marks.cost(state) + held
+
+    def add(self, state: State, information: Array, gradient: Array) -> None:
+        """Add to the normal equations (c, c) and (c,) of the camera side, see `Columns`."""
+        mine, right = self._quadratic(state)
+        information += mine
+        gradient += right
+        self._marks.add(state, information, gradient)
+        turn = slice(self.aligned(state).first, self.aligned(state).first + 3)
+        information[turn, turn] += self._held
+        gradient[turn] += self._held @ state.control[:3]
+
+    def errors(self, state: State) -> list[tuple[str, float]]:
+        """Of each factor what it is on, and its error in standard deviations."""
+        return self._factors.errors(*self._in_factors_world(state))
+
+    def _in_factors_world(self, state: State) -> tuple[Array, Array, Array]:
+        """Poses (`cam_from_world`) and landmarks in the world of the factors."""
+        world = self.aligned(state).similarity
+        rotation = state.rotation @ world.rotation.T
+        centers = world.points(-np.einsum("kji,kj->ki", state.rotation, state.translation))
+        points = world.points(state.control[ALIGNMENT:].reshape(-1, 3))
+        return rotation, -np.einsum("kij,kj->ki", rotation, centers), points
+
+    def _quadratic(self, state: State) -> tuple[Array, Array]:
+        """The factors alone, by the columns of the adjustment."""
+        aligned = self.aligned(state)
+        by_columns = np.zeros((6 * len(state.rotation) + len(state.control) - ALIGNMENT, aligned.columns.size))
+        alignment = aligned.first + np.arange(ALIGNMENT)
+        for row, rotation in enumerate(state.rotation):
+            _, _, by_place = aligned.known_place(Place(row, camera=True))
+            cam_from_world = rotation @ aligned.rotation.T
+            pose, columns = by_columns[6 * row : 6 * row + 6], aligned.columns.pose(row)
+            pose[:3, columns[:3]] = np.eye(3)
+            pose[3:, columns[3:]] = aligned.scale * np.eye(3)
+            pose[:3, alignment[:3]] = rotation @ aligned.own_turn
+            pose[3:, alignment] = cam_from_world @ by_place[:, 3:]
+        for row in range((len(state.control) - ALIGNMENT) // 3):
+            _, columns, by_place = aligned.known_place(Place(row))
+            begin = 6 * len(state.rotation) + 3 * row
+            by_columns[begin : begin + 3, columns] = by_place
+        information, gradient = self._factors.quadratic(*self._in_factors_world(state))
+        return by_columns.T @ information @ by_columns, by_columns.T @ gradient

@@ -1,0 +1,97 @@
+"""From the free solution to the one that respects factors of the caller."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
+from factorsfm.adjustment.observations import Observations
+from factorsfm.adjustment.problem import Free, Known
+from factorsfm.adjustment.state import State
+from factorsfm.control.factor_term import FactorTerm, PoseFactors
+from factorsfm.control.fit import ControlFit, ControlResidual
+from factorsfm.control.residuals import MarkItem, Place
+from factorsfm.control.solve import Controlled, described
+from factorsfm.control.solved_control import triangulated
+from factorsfm.support.rotations import camera_centers
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+_KERNEL = 3.0  # Cauchy scale of the observations of landmarks, standard deviations
+_CONTRADICTION = 4.0  # standard deviations
+_STEPS, _TOLERANCE = 25, 2e-5
+_POINT_SIGMA = 5.0  # a weak prior of the points: factors may change the shape of the scene
+
+
+@dataclass(frozen=True, slots=True)
+class ShotFactors:
+    """Factors of the caller on a shot, in the world of its live map.
+
+    Attributes:
+        frames: positions of the frames that they name; tracks: (t,) the landmarks.
+        poses: `cam_from_world` rotation and translation in the live map, by position.
+        on_poses: makes them a function of the poses at some positions and of some of the tracks.
+    """
+
+    frames: list[int]
+    tracks: Index
+    poses: dict[int, tuple[Array, Array]]
+    on_poses: Callable[[Sequence[int], Sequence[int]], PoseFactors]
+
+
+def solve_with_factors(
+    adjustment: BundleAdjustment, factors: ShotFactors, marks: Observations, frames: list[int]
+) -> Controlled:
+    """Solve once more, with the factors.
+
+    Args:
+        adjustment: the free solution; marks: observations of the tracks (rows in `factors.tracks`) in its frames.
+        frames: position of each of its frames in the source.
+    """
+    state = adjustment.state
+    places = triangulated(state, marks, np.bincount(marks.point, minlength=len(factors.tracks)))
+    placed = np.flatnonzero(np.isfinite(places[:, 0]))
+    marks, places = marks.of(placed), places[placed]
+    rotation, anchor, shift, scale = _alignment(state, factors, frames)
+    state = replace(state, control=np.concatenate([np.zeros(3), shift, [np.log(scale)], places.ravel()]))
+    on_poses = factors.on_poses(frames, factors.tracks[placed].tolist())
+    term = FactorTerm(on_poses, _items(marks, adjustment.sigma), rotation, anchor, _KERNEL, state)
+    solved = BundleAdjustment(
+        state, adjustment.observations,
+        replace(adjustment.options, point_sigma=_POINT_SIGMA, iterations=_STEPS, tolerance=_TOLERANCE),
+        adjustment.errors, prior=adjustment.prior, free=Free(held=np.arange(len(frames)) == 0),
+        known=Known(control=term),
+    )  # fmt: skip
+    solved.solve()
+    residuals = [
+        ControlResidual(name, "sigma", error, 1.0, error, error > _CONTRADICTION)
+        for name, error in term.errors(solved.state)
+    ]
+    controlled = described(solved, term, lambda scale_std, position_std: ControlFit(
+        residuals, [], [], placed=True, scale_std=scale_std, position_std=position_std, source="factors",
+    ))  # fmt: skip
+    return controlled if term.determines_scale else replace(controlled, world_alignment=None)
+
+
+def _alignment(state: State, factors: ShotFactors, frames: list[int]) -> tuple[Array, Array, Array, float]:
+    """Rotation and anchor of the alignment to the live map, where the anchor is there, and the scale."""
+    known = [row for row, position in enumerate(frames) if position in factors.poses]
+    live = [factors.poses[frames[row]] for row in known]
+    centers = camera_centers(state.rotation[known], state.translation[known])
+    live_centers = camera_centers(np.array([turn for turn, _ in live]), np.array([shift for _, shift in live]))
+    away, live_away = centers - centers[0], live_centers - live_centers[0]
+    scale = float(np.linalg.norm(live_away)) / max(float(np.linalg.norm(away)), 1e-12)
+    rotation = live[0][0].T @ state.rotation[known[0]]
+    return rotation, centers[0], live_centers[0], scale if np.isfinite(scale) and scale > 0.0 else 1.0
+
+
+def _items(marks: Observations, sigma: float) -> list[MarkItem]:
+    return [
+        MarkItem(f"landmark {point}", row, Place(point), pixels, sigma)
+        for row, point, pixels in zip(marks.frame.tolist(), marks.point.tolist(), marks.pixels, strict=True)
+    ]

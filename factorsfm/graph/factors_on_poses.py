@@ -1,0 +1,109 @@
+"""What factors of the caller say of poses and landmarks, as a quadratic: their own variables are eliminated."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import L, X
+from numpy.typing import NDArray
+
+from factorsfm.graph.added_factors import AddedFactors, MapValues, held_prior, keys_of, name_of, part_of, present_values
+from factorsfm.graph.factors import pose_from_camera
+
+Array = NDArray[np.float64]
+
+_STEPS = 4  # to the best values of the caller's variables, from the last ones
+_WEAK = 1e-9  # information of what nothing determines
+
+
+class FactorsOnPoses:
+    """Factors as a function of some poses and landmarks; all else that they name follows.
+
+    Args:
+        added: the factors; contents: of the map, where the variables begin that are not among the poses and landmarks.
+        frames, tracks: the poses and landmarks, in the order of the rows and columns.
+    """
+
+    def __init__(self, added: AddedFactors, contents: MapValues, frames: Sequence[int], tracks: Sequence[int]) -> None:
+        self._graph, self._own = added.graph(), added.values()
+        self._keys = [*map(X, frames), *map(L, tracks)]
+        named = keys_of(self._graph)
+        self._own.insert(present_values(added.named - set(self._keys), contents))
+        self._named = [row for row, key in enumerate(self._keys) if key in named]
+        ends = np.cumsum([6 if row < len(frames) else 3 for row in range(len(self._keys))])
+        self._columns = np.split(np.arange(ends[-1]), ends[:-1])
+
+    def cost(self, rotation: Array, translation: Array, points: Array) -> float:
+        """The least cost, with the best values of all other variables.
+
+        Args:
+            rotation (n, 3, 3), translation (n, 3): `cam_from_world`; points: (p, 3) landmarks.
+        """
+        return float(self._graph.error(self._best(self._at(rotation, translation, points))))
+
+    def quadratic(self, rotation: Array, translation: Array, points: Array) -> tuple[Array, Array]:
+        """Information (d, d) and gradient (d,) of that cost, d = 6 n + 3 p; poses are perturbed as in `factors`."""
+        values = self._best(self._at(rotation, translation, points))
+        linear = self._graph.linearize(values)
+        others = _ordering(self._own.keys())
+        for key in list(self._own.keys()):
+            size = self._own.dims()[key]
+            linear.add(key, np.sqrt(_WEAK) * np.eye(size), np.zeros(size), gtsam.noiseModel.Unit.Create(size))
+        if others.size():
+            linear = linear.eliminatePartialMultifrontal(others)[1]
+        size = int(self._columns[-1][-1]) + 1
+        information, gradient = np.zeros((size, size)), np.zeros(size)
+        mine = [row for row in self._named if self._keys[row] in set(linear.keyVector())]
+        if mine:
+            columns = np.concatenate([self._columns[row] for row in mine])
+            hessian, right = linear.hessian(_ordering([self._keys[row] for row in mine]))
+            information[np.ix_(columns, columns)] = hessian
+            gradient[columns] = -np.asarray(right).ravel()
+        return information, gradient
+
+    def errors(self, rotation: Array, translation: Array, points: Array) -> list[tuple[str, float]]:
+        """Of each factor what it is on, and its error in standard deviations (root of twice its cost)."""
+        values = self._best(self._at(rotation, translation, points))
+        factors = [self._graph.at(k) for k in range(self._graph.size())]
+        return [
+            (
+                f"{type(f).__name__} on {', '.join(map(name_of, f.keys()))}",
+                float(np.sqrt(2.0 * max(f.error(values), 0.0))),
+            )
+            for f in factors
+        ]
+
+    def _at(self, rotation: Array, translation: Array, points: Array) -> gtsam.Values:
+        values = gtsam.Values()
+        for row in self._named:
+            if row < len(rotation):
+                values.insert(self._keys[row], pose_from_camera(rotation[row], translation[row]))
+            else:
+                values.insert(self._keys[row], points[row - len(rotation)])
+        return values
+
+    def _best(self, fixed: gtsam.Values) -> gtsam.Values:
+        """With the best values of all other variables (Levenberg-Marquardt); they are where the next search begins."""
+        values = gtsam.Values(fixed)
+        values.insert(self._own)
+        if not self._own.size():
+            return values
+        graph = gtsam.NonlinearFactorGraph(self._graph)
+        for key in list(fixed.keys()):
+            graph.add(held_prior(key, fixed))
+        parameters = gtsam.LevenbergMarquardtParams()
+        parameters.setMaxIterations(_STEPS)
+        found = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
+        self._own = part_of(found, list(self._own.keys()))
+        values = gtsam.Values(fixed)
+        values.insert(self._own)
+        return values
+
+
+def _ordering(keys: Sequence[int]) -> gtsam.Ordering:
+    ordering = gtsam.Ordering()
+    for key in keys:
+        ordering.push_back(key)
+    return ordering
