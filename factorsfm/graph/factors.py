@@ -195,6 +195,7 @@ def native_affine_noise(scale_sigma: float, shift_sigma: float) -> gtsam.noiseMo
 
 # --- the keyframe graph -------------------------------------------------------------------------------------------
 
+_PINNED_PX = 1e-3  # standard deviation of what does not count in a lens, pixels: less makes the system ill-conditioned
 KERNEL = 2.0  # Cauchy scale of measurements, standard deviations
 
 
@@ -237,7 +238,7 @@ def lens_of(focal: float) -> gtsam.Cal3_S2:
 
 def lens_prior(key: int, focal: float, sigma: float) -> gtsam.PriorFactorCal3_S2:
     """Prior of a lens around one focal length for both axes, `sigma` in pixels; the rest is pinned."""
-    covariance = np.diag(np.full(5, 1e-6) ** 2)
+    covariance = np.diag(np.full(5, _PINNED_PX**2))
     covariance[:2, :2] += sigma**2
     return gtsam.PriorFactorCal3_S2(key, lens_of(focal), gtsam.noiseModel.Gaussian.Covariance(covariance))
 

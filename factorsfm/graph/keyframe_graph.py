@@ -26,7 +26,6 @@ logger = logging.getLogger(__name__)
 _LARGEST_ERROR_PX = 10.0  # median, of the newest keyframe
 _LEAST_IN_FRONT = 0.7  # of the landmarks of the newest keyframe
 _FIRM_LANDMARK_SIGMA = 0.3  # see `LANDMARK_SIGMA`, where an update fails
-_LENS_STD = 0.0022  # relative, of independent observations, with which a focal length counts as determined
 _LARGEST_LENS_STEP = 0.5  # of the logarithm of the focal length
 _MIRRORED = "the depth is mirrored: the scale of a prior is negative"
 
@@ -102,11 +101,10 @@ def _with_open_lens(live: LiveIsam, window: Window) -> tuple[LiveIsam, Window]:
     """The graph with the focal length among its variables, from when on the map determines it."""
     if not window.open_lens or live.free_lens:
         return live, window
-    trial = live.copy()
     try:
-        solved = trial.estimate_lens(window)
-        if trial.focal_std() < _LENS_STD and not _fault(solved, window.focal):
-            return trial, solved
+        found = live.with_free_lens(window)
+        if found is not None and not _fault(found[1], window.focal):
+            return found
     except Exception as error:
         logger.debug("the focal length stays as it is: %s", _first_line(error))
     return live, window

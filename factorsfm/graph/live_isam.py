@@ -45,7 +45,9 @@ _SIZE_SIGMA = 1e-4  # relative, of the distance that holds the unit of length
 LANDMARK_SIGMA = 3.0  # of the weak prior of a landmark, in units of its distance
 _DEPTHS = 100  # depth factors of a keyframe, beside one for each landmark that has none yet: errors of a network repeat
 _FREE_LENS = 0.3  # relative standard deviation of a focal length that is estimated
+_LENS_STD = 0.0022  # relative, of independent observations, with which a focal length counts as determined
 _LENS_STEPS, _LENS_TOLERANCE = 6, 1e-4
+_LENS_STEP = 0.03  # of the logarithm of the focal length, that can be made in one go
 _LANDMARK = ord("l")  # character of the symbols L
 
 
@@ -113,23 +115,43 @@ class LiveIsam:
             self._isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), [], last)
         return self._solved(window)
 
-    def estimate_lens(self, window: Window) -> Window:
-        """Let the focal length go, too; the window with its values after a few steps."""
-        key, changes = K(0), _Changes()
-        changes.removed.append(self._priors[key])
-        changes.add([lens_prior(key, self._focal, _FREE_LENS * self._focal)], partial(self._note_prior, key))
-        self.free_lens = True
-        last = self._eliminated_last(changes)
-        result = self._isam.update(changes.graph, changes.values, changes.removed, last)
-        changes.settle(np.array(result.getNewFactorsIndices(), np.int64))
-        solved = self._solved(window)
-        for _ in range(_LENS_STEPS - 1):
+    def with_free_lens(self, window: Window) -> tuple[LiveIsam, Window] | None:
+        """A copy in which the focal length is estimated, and the window with its values; None where it stays open.
+
+        Where a first step goes far, the focal length is led there a little at a time: in one go the reprojections would
+        be so far off that the robust kernel drops them.
+        """
+        live = self.copy()
+        live._free_lens()
+        if live.focal_std() > 2.0 * _LENS_STD:
+            return None
+        before, after = window.focal, live._solved(window).focal
+        if (steps := int(abs(np.log(after / before)) / _LENS_STEP)) > 0:
+            live = self.copy()
+            for focal in np.geomspace(before, after, steps + 2)[1:].tolist():
+                live._set_lens_prior(focal, HELD)
+            live._free_lens()
+        solved = live._solved(window)
+        for _ in range(_LENS_STEPS):
             before = solved.focal
-            self._isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), [], last)
-            solved = self._solved(window)
+            live._free_lens()
+            solved = live._solved(window)
             if abs(solved.focal / before - 1.0) < _LENS_TOLERANCE:
                 break
-        return solved
+        return (live, solved) if live.focal_std() < _LENS_STD else None
+
+    def _free_lens(self) -> None:
+        self.free_lens = True
+        focal = self._isam.calculateEstimate().atCal3_S2(K(0)).fx()
+        self._set_lens_prior(focal, _FREE_LENS * focal)
+
+    def _set_lens_prior(self, focal: float, sigma: float) -> None:
+        """Another prior of the focal length, and a step with it."""
+        key, changes = K(0), _Changes()
+        changes.removed.append(self._priors[key])
+        changes.add([lens_prior(key, focal, sigma)], partial(self._note_prior, key))
+        result = self._isam.update(changes.graph, changes.values, changes.removed, self._eliminated_last(changes))
+        changes.settle(np.array(result.getNewFactorsIndices(), np.int64))
 
     def _eliminated_last(self, changes: _Changes) -> gtsam.KeyGroupMap:
         """Poses and affines, after the landmarks.
