@@ -1,5 +1,6 @@
 """Factors that a user adds to a running stream: taken as a whole, kept through everything, and heard by the polish."""
 
+import itertools
 import os
 import signal
 from functools import cache
@@ -33,7 +34,7 @@ def metric(shot: RenderedShot, k: int) -> gtsam.Pose3:
 def odometry(shot: RenderedShot, frames: list[int]) -> gtsam.NonlinearFactorGraph:
     """How far the camera has come between successive frames."""
     graph = gtsam.NonlinearFactorGraph()
-    for i, j in zip(frames[:-1], frames[1:], strict=True):
+    for i, j in itertools.pairwise(frames):
         graph.add(gtsam.BetweenFactorPose3(X(i), X(j), metric(shot, i).between(metric(shot, j)), POSE_NOISE))
     return graph
 
@@ -104,10 +105,10 @@ def test_a_long_shot_keeps_few_factors_and_says_of_all_of_them():
 
 def test_a_pinned_landmark_stays_where_it_was_surveyed(stream):
     shot = rendered("truck")
-    for k, image in enumerate(shot.images[:5]):
+    for image in shot.images[:5]:
         stream.push(image, keyframe=True)
     stream.trajectory()
-    graph, values = stream.graph()
+    _, values = stream.graph()
     track = next(gtsam.symbolIndex(key) for key in list(values.keys()) if gtsam.symbolChr(key) == ord("l"))
     place = 1.01 * values.atPoint3(L(track))
     prior = gtsam.NonlinearFactorGraph()
@@ -145,7 +146,7 @@ def test_variables_of_the_user_are_solved_for(stream):
 
 def test_they_survive_a_snapshot(tmp_path, stream):
     shot = rendered("truck")
-    for k, image in enumerate(shot.images[:5]):
+    for image in shot.images[:5]:
         stream.push(image, keyframe=True)
     stream.add_factors(odometry(shot, list(stream.keyframes)), gtsam.Values())
     stream.save(tmp_path / "waiting")
@@ -211,9 +212,9 @@ def test_what_cannot_be_taken_is_said_at_once(stream):
         stream.push(image, keyframe=True)
     with pytest.raises(InputError, match="unknown key x6: it is not a keyframe of the map"):
         stream.add_factors(odometry(shot, [3, 6]), nothing)
+    custom = gtsam.NonlinearFactorGraph()
+    custom.add(gtsam.CustomFactor(POSE_NOISE, [X(0)], lambda this, values, jacobians: np.zeros(6)))
     with pytest.raises(InputError, match="a Python callback"):
-        custom = gtsam.NonlinearFactorGraph()
-        custom.add(gtsam.CustomFactor(POSE_NOISE, [X(0)], lambda this, values, jacobians: np.zeros(6)))
         stream.add_factors(custom, nothing)
     control = Control(distances=[KnownDistance(length=1.0, sigma=0.1, frames=(0, 5))])
     with Stream(shot.camera, control=control) as other, pytest.raises(InputError, match="a stream with control"):
