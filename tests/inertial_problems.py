@@ -28,7 +28,7 @@ class InertialProblem:
     motion: CameraMotion
 
 
-def inertial_problem(seed, noisy=True, seconds=6.0, reach=0.25, turn=0.3):
+def inertial_problem(seed, noisy=True, seconds=6.0, reach=0.25, turn=0.3, noise=None):
     """Keyframes 0.3 s apart; noise: 0.1 % of the path, 0.02 degrees, that of a phone's IMU and its biases."""
     rng = np.random.default_rng([seed, 99])
     path = handheld_path(seconds, seed, reach, turn)
@@ -40,7 +40,7 @@ def inertial_problem(seed, noisy=True, seconds=6.0, reach=0.25, turn=0.3):
         gravity=gravity,
         gyroscope_bias=biases[0],
         accelerometer_bias=biases[1],
-        noise=ImuNoise() if noisy else None,
+        noise=(noise or ImuNoise()) if noisy else None,
         seed=seed,
     )
     time = np.arange(0.0, seconds - 0.01, 0.3)

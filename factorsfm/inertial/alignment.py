@@ -106,9 +106,9 @@ class VisualPoses:
 
 
 def align_inertial(recording: ImuRecording, poses: VisualPoses) -> InertialAlignment:
-    """Find metric scale, gravity, velocities and biases; biases are constant over the keyframes.
+    """Find metric scale, gravity, velocities and biases; the biases are those at the first keyframe.
 
-    Takes well under a second for a hundred keyframes; the time grows with the cube of their number.
+    Some ten seconds are enough; the time it takes grows with the cube of the number of keyframes.
 
     Args:
         recording: its rotation to the camera and time offset must be known; it covers the keyframes.
@@ -157,11 +157,11 @@ def _first_values(recording: ImuRecording, poses: VisualPoses) -> tuple[Array, A
     """Unknowns from unweighted equations: the gyroscope's bias from the rotations, then the rest without biases."""
     shared, velocities = np.zeros(_SHARED), np.zeros((len(poses.time), 3))
     for _ in range(2):
-        residual, slope, _, _ = _equations(recording, poses, shared, velocities)
-        turns, by_bias = residual.reshape(-1, 9)[:, :3].ravel(), slope.reshape(-1, 9, slope.shape[1])[:, :3]
-        by_bias = by_bias[:, :, _SHARED - 3 : _SHARED].reshape(-1, 3)
+        residual, slope, _ = _equations(recording, poses, shared, velocities)
+        turns = residual.reshape(-1, 9)[:, :3].ravel()
+        by_bias = slope.reshape(-1, 9, slope.shape[1])[:, :3, _TURN_BIAS].reshape(-1, 3)
         shared[_TURN_BIAS] -= np.linalg.lstsq(by_bias, turns, rcond=None)[0]
-    residual, slope, _, _ = _equations(recording, poses, shared, velocities)
+    residual, slope, _ = _equations(recording, poses, shared, velocities)
     columns = [_RHO, 1, 2, 3, *range(_SHARED, slope.shape[1])]
     basis = np.linalg.qr(slope[:, columns[1:]])[0]  # of what gravity and velocities explain
     camera, imu = (motion - basis @ (basis.T @ motion) for motion in (residual, -slope[:, _RHO]))
@@ -182,33 +182,32 @@ def _solve(
     """Gauss-Newton on the weighted equations, with the priors of the biases and of the magnitude of gravity."""
     shared, velocities = shared.copy(), velocities.copy()
     for _ in range(_ITERATIONS):
-        residual, slope, visual, inertial = _equations(recording, poses, shared, velocities)
-        weight = np.linalg.cholesky(visual + inertial)
-        prior, prior_slope = _priors(recording.noise, shared, gravity_sigma)
-        rows = np.concatenate([np.linalg.solve(weight, residual), prior])
-        jacobian = np.linalg.solve(weight, slope)
-        jacobian = np.vstack([jacobian, np.pad(prior_slope, ((0, 0), (0, velocities.size)))])
-        scaled = np.linalg.norm(jacobian, axis=0)
-        step = np.linalg.lstsq(jacobian / scaled, -rows, rcond=None)[0] / scaled
+        residual, slope, covariance = _equations(recording, poses, shared, velocities)
+        whitened = np.linalg.solve(np.linalg.cholesky(covariance), np.column_stack([slope, residual]))
+        rows = np.vstack([whitened, _priors(recording.noise, shared, gravity_sigma, velocities.size)])
+        size = np.linalg.norm(rows[:, :-1], axis=0)
+        # The triangle of the unknowns with the residuals as the last column; what they do not explain is its corner.
+        triangle = np.asarray(np.linalg.qr(rows / np.append(size, 1.0), mode="r"))
+        triangle[:-1, :-1] += 1e-12 * np.eye(len(size))  # what is open altogether stays where it is
+        inverse = np.linalg.inv(triangle[:-1, :-1]) / size[:, None]
+        step = -inverse @ triangle[:-1, -1]
         # A ratio must stay positive; far from the solution half of it is enough of a step.
         shared += step[:_SHARED] * min(1.0, shared[_RHO] / 2 / max(abs(step[_RHO]), 1e-300))
         velocities += step[_SHARED:].reshape(-1, 3)
         if abs(step[_RHO]) < _CONVERGED * shared[_RHO]:
             break
-    misfit = float(np.sum((rows + jacobian @ step) ** 2) / (len(rows) - jacobian.shape[1]))
-    inverse = np.linalg.pinv(jacobian / scaled)[:_SHARED] / scaled[:_SHARED, None]
-    covariance = np.asarray(inverse @ inverse.T * max(1.0, misfit), np.float64)
-    return _Solution(shared, velocities, covariance, misfit)
+    misfit = float(triangle[-1, -1] ** 2 / (len(rows) - len(size)))
+    return _Solution(shared, velocities, inverse[:_SHARED] @ inverse[:_SHARED].T * max(1.0, misfit), misfit)
 
 
 def _equations(
     recording: ImuRecording, poses: VisualPoses, shared: Array, velocities: Array
-) -> tuple[Array, Array, Array, Array]:
+) -> tuple[Array, Array, Array]:
     """Rotation, velocity and position (9 rows) of each interval, camera less IMU, in the camera's axes at its start.
 
     Returns:
         The residuals (9 n,), their derivatives by the unknowns and the velocities (9 n, 10 + 3 m), and their
-        covariances (9 n, 9 n) from the visual poses and from the IMU.
+        covariance (9 n, 9 n).
     """
     rho, gamma = shared[_RHO], shared[_GAMMA]
     motion = preintegrate(recording, poses.time[:-1], poses.time[1:], shared[_TURN_BIAS], shared[_FORCE_BIAS])
@@ -236,10 +235,11 @@ def _equations(
         here = _SHARED + 3 * k
         slope[k, 3:6, here : here + 3], slope[k, 3:6, here + 3 : here + 6] = -cam_from_world[k], cam_from_world[k]
         slope[k, 6:, here : here + 3] = -cam_from_world[k] * t[k]
-    inertial = np.zeros((n, 9, n, 9))
-    inertial[np.arange(n), :, np.arange(n)] = units[:, None] * motion.covariance * units
-    visual = _visual_covariance(poses.covariance, turned, faster, moved)
-    return residual.ravel(), slope.reshape(9 * n, -1), visual, inertial.reshape(9 * n, 9 * n)
+    covariance = _visual_covariance(poses.covariance, turned, faster, moved)
+    covariance += _walk_covariance(recording.noise, np.cumsum(motion.duration) - motion.duration / 2, by_bias)
+    block = covariance.reshape(n, 9, n, 9)
+    block[np.arange(n), :, np.arange(n)] += units[:, None] * motion.covariance * units
+    return residual.ravel(), slope.reshape(9 * n, -1), covariance
 
 
 def _visual_covariance(covariance: Array, turned: Array, faster: Array, moved: Array) -> Array:
@@ -255,16 +255,29 @@ def _visual_covariance(covariance: Array, turned: Array, faster: Array, moved: A
     return np.asarray(weighed.reshape(9 * n, -1) @ by_pose.reshape(9 * n, -1).T)
 
 
-def _priors(noise: ImuNoise, shared: Array, gravity_sigma: float) -> tuple[Array, Array]:
-    """Whitened residuals (7,) of the biases and of the magnitude of gravity, and their derivatives (7, 10)."""
+def _walk_covariance(noise: ImuNoise, middle: Array, by_bias: Array) -> Array:
+    """(9 n, 9 n) covariance of the residuals from the random walks of the biases since the first keyframe.
+
+    Args:
+        middle: (n,) seconds from the first keyframe to the middle of each interval.
+        by_bias: (n, 9, 6) derivatives of the residuals by the biases.
+    """
+    n = len(middle)
+    walk = np.repeat([noise.gyroscope_walk, noise.accelerometer_walk], 3) * by_bias
+    shared = np.minimum(middle[:, None], middle)
+    return np.asarray(np.einsum("nri,mci->nrmc", walk, walk) * shared[:, None, :, None]).reshape(9 * n, 9 * n)
+
+
+def _priors(noise: ImuNoise, shared: Array, gravity_sigma: float, others: int) -> Array:
+    """Whitened rows of the biases and of the magnitude of gravity: derivatives and residual, (7, 10 + others + 1)."""
     slope = np.zeros((7, _SHARED))
     slope[:3, _FORCE_BIAS] = np.eye(3) / noise.accelerometer_bias
     slope[3:6, _TURN_BIAS] = np.eye(3) / noise.gyroscope_bias
     gamma = float(np.linalg.norm(shared[_GAMMA]))
     sigma = gravity_sigma * shared[_RHO]
     slope[6, _GAMMA], slope[6, _RHO] = shared[_GAMMA] / gamma / sigma, -GRAVITY / sigma
-    residual = slope @ shared  # all are linear in the unknowns, the magnitude along its own direction
-    return residual, slope
+    # All are linear in the unknowns, the magnitude along its own direction.
+    return np.column_stack([slope, np.zeros((7, others)), slope @ shared])
 
 
 def _check(free: _Solution) -> None:

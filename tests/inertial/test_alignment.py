@@ -50,6 +50,18 @@ def test_errors_are_covered_by_their_standard_deviations():
     assert 0.8 < np.mean(misfits) < 1.1
 
 
+def test_biases_that_walk_are_expected_to():
+    """An accelerometer whose bias wanders by some 0.07 m/s^2: taken for constant, the misfit would be above 4."""
+    noise, misfits, off = ImuNoise(accelerometer_walk=0.03), [], []
+    for seed in range(8):
+        problem = inertial_problem(seed, noise=noise)
+        found = align_inertial(problem.recording, problem.poses)
+        misfits.append(found.misfit)
+        off.append(np.radians(angle(found.gravity, problem.gravity)) / found.gravity_sigma)
+    assert 0.7 < np.mean(misfits) < 1.3
+    assert 0.5 < np.sqrt(np.mean(np.square(off))) < 1.6
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_an_imu_whose_clock_and_axes_are_unknown(seed):
     """The mounting from frames at 30 per second, the lever arm given, then scale and gravity."""
