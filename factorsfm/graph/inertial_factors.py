@@ -122,7 +122,7 @@ def inertial_graph(
     Raises:
         InputError: the recording does not cover the keyframes.
     """
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    recording, graph, values = recording.at_camera(), gtsam.NonlinearFactorGraph(), gtsam.Values()
     biases = alignment.gyroscope_bias, alignment.accelerometer_bias
     graph.add(bias_prior(frames[0], recording.noise, np.zeros(3), np.zeros(3), scale))
     for k, (i, velocity) in enumerate(zip(frames, alignment.velocities, strict=True)):

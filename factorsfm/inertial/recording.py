@@ -100,6 +100,8 @@ class ImuRecording:
         """
         if self.cam_from_imu is None or self.time_offset is None:
             raise InputError("the rotation from the IMU to the camera or its time offset is unknown; both are needed")
+        if self.time_offset == 0 and not self.lever_arm.any() and np.array_equal(self.cam_from_imu, np.eye(3)):
+            return self
         turn = self.gyroscope @ self.cam_from_imu.T
         force = self.accelerometer @ self.cam_from_imu.T
         if self.lever_arm.any():

@@ -75,7 +75,7 @@ def fit_timing(recording: ImuRecording, time: Array, world_from_cam: Array) -> I
 
     Args:
         recording: of the IMU; its `time_offset` and `cam_from_imu` are held where they are known.
-        time: (n,) seconds on the video's clock, ascending.
+        time: (n,) seconds on the video's clock, ascending, of the middle row where the shutter rolls.
         world_from_cam: (n, 3, 3) rotations of successive frames; NaN where a frame has none.
 
     Raises:
@@ -175,7 +175,7 @@ def _search(gyroscope: _Gyroscope, time: Array, turns: Array, start: float, cam_
         )
     peaks = np.flatnonzero((correlation[1:-1] >= correlation[:-2]) & (correlation[1:-1] >= correlation[2:])) + 1
     peaks = peaks[abs(offsets[peaks] - offsets[best]) > _LOBE]
-    if len(peaks):
+    if len(peaks) and correlation[best] > _LOWEST_CORRELATION:  # a lower one is refused for itself
         second = peaks[np.argmax(correlation[peaks])]
         if 1 - correlation[second] ** 2 < _SECOND_BEST * (1 - correlation[best] ** 2):
             raise ReconstructionError(

@@ -61,6 +61,11 @@ def test_an_imu_off_the_camera_is_moved_into_its_centre():
     assert abs(ignored.accelerometer - at_center.accelerometer).max() > 0.1
 
 
+def test_an_imu_in_the_camera_stays_there():
+    recording = simulate_imu(handheld_path(1.0))
+    assert recording.at_camera() is recording
+
+
 def test_the_mounting_must_be_known():
     with pytest.raises(InputError, match="the rotation from the IMU to the camera or its time offset is unknown"):
         ImuRecording(TIME, *REST, time_offset=0.0).at_camera()
