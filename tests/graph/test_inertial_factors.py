@@ -5,11 +5,11 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from gtsam.symbol_shorthand import B, G, S, V, X
+from gtsam.symbol_shorthand import B, G, L, S, V, X
 
 from factorsfm.graph.inertial_factors import bias_prior, gravity_prior, inertial_factor, inertial_graph, preintegrated
 from factorsfm.inertial.alignment import align_inertial
-from factorsfm.inertial.preintegration import preintegrate
+from factorsfm.inertial.preintegration import inertial_steps, preintegrate
 from factorsfm.inertial.recording import GRAVITY, ImuNoise
 from factorsfm.support.errors import InputError
 from factorsfm.support.rotations import exponential
@@ -109,6 +109,21 @@ def test_a_lever_arm_is_taken_away():
     assert errors[1] < errors[0] + 0.2
     ignored = replace(recording(lever_arm=[0.06, -0.03, 0.02]), lever_arm=np.zeros(3))
     assert inertial_factor(4, 7, preintegrated(ignored, *TIMES, DOWN, *BIASES)).error(true_values()) > 5.0
+
+
+def test_gtsams_own_lever_arm_leaves_out_the_angular_acceleration():
+    """Why `body_P_sensor` stays unset: with it the velocity is hardly better than with no lever arm at all."""
+    arm, none = np.array([0.06, -0.03, 0.02]), np.zeros(3)
+    off, at_center = (simulate_imu(PATH, 800.0, lever_arm=lever) for lever in (arm, none))
+    truth = preintegrate(at_center, *(np.array([t]) for t in TIMES), none, none).velocity[0]
+    parameters = preintegrated_parameters(off.noise)
+    parameters.setBodyPSensor(gtsam.Pose3(gtsam.Rot3(), arm))
+    own = gtsam.PreintegratedCombinedMeasurements(parameters)
+    samples = zip(*(values[0] for values in inertial_steps(off, *(np.array([t]) for t in TIMES))), strict=True)
+    for duration, turn, force in samples:
+        own.integrateMeasurement(force, turn, max(duration, 1e-9))
+    assert np.linalg.norm(preintegrated(off, *TIMES, DOWN, none, none).deltaVij() - truth) < 1e-5
+    assert np.linalg.norm(own.deltaVij() - truth) > 5e-3
 
 
 @pytest.mark.parametrize("gravity_key", [None, G(0)])
@@ -225,3 +240,28 @@ def test_scale_and_gravity_of_twenty_handheld_shots():
     assert max(chi) < 14.2  # three standard deviations in three dimensions
     assert 0.7 < np.sqrt(np.mean(by_sigma**2)) < 1.4
     assert 0.4 < np.mean(chi) / 3 < 1.4
+
+
+def test_a_map_of_landmarks_takes_the_scale_of_the_factors():
+    """Landmarks in units of 3.7 m; the factors take the unit for a fifth more, and the map shrinks to it."""
+    problem, scale = inertial_problem(0), 1.2 * METRES_PER_UNIT
+    poses, rng, noise = problem.poses, np.random.default_rng(0), gtsam.noiseModel.Isotropic.Sigma(2, 0.3)
+    count, lens = len(poses.time), gtsam.Cal3_S2(500.0, 500.0, 0.0, 0.0, 0.0)
+    alignment = align_inertial(problem.recording, poses)
+    graph, values = inertial_graph(problem.recording, range(count), poses.time, alignment, G(0), scale)
+    truth = [
+        gtsam.Pose3(gtsam.Rot3(rotation), center / METRES_PER_UNIT)
+        for rotation, center in zip(problem.motion.world_from_cam, problem.motion.center, strict=True)
+    ]
+    graph.add(gtsam.PriorFactorPose3(X(0), truth[0], gtsam.noiseModel.Isotropic.Sigma(6, 1e-4)))
+    for i, pose in enumerate(truth):
+        values.insert(X(i), pose)
+    for j, point in enumerate(rng.uniform([-0.4, -0.3, 0.6], [0.4, 0.3, 2.0], (60, 3))):
+        values.insert(L(j), point)
+        for i, pose in enumerate(truth):
+            pixels = gtsam.PinholeCameraCal3_S2(pose, lens).project(point) + 0.3 * rng.standard_normal(2)
+            graph.add(gtsam.GenericProjectionFactorCal3_S2(pixels, noise, X(i), L(j), lens))
+    solution = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    sizes = [sum(v.atPose3(X(0)).range(v.atPose3(X(i))) for i in range(1, count)) for v in (values, solution)]
+    assert sizes[1] * scale / (sizes[0] * METRES_PER_UNIT) == pytest.approx(1.0, abs=0.005)
+    assert angle(solution.atPoint3(G(0)), problem.gravity) < 0.5
