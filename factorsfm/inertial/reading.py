@@ -61,11 +61,12 @@ def read_imu(path: str | Path) -> ImuRecording:
     path = Path(path)
     names, skip, keys = _head(path)
     columns, factors = _columns(path, names, keys)
-    samples = _samples(path, skip, columns, len(names)) * factors
+    with np.errstate(over="ignore"):  # infinity is refused below
+        samples = _samples(path, skip, columns, len(names)) * factors
     gyroscope, accelerometer = samples[:, 1:4], samples[:, 4:]
     if keys is not None:
-        axes = _orientation(path, keys.get("orientation", "XYZ"))
-        gyroscope, accelerometer = gyroscope @ axes.T, accelerometer @ axes.T
+        order, signs = _orientation(path, keys.get("orientation", "XYZ"))
+        gyroscope, accelerometer = gyroscope[:, order] * signs, accelerometer[:, order] * signs
     try:
         return ImuRecording(samples[:, 0], gyroscope, accelerometer)
     except InputError as error:
@@ -149,14 +150,13 @@ def _gcsv_column(path: Path, name: str, keys: dict[str, str]) -> tuple[int, floa
     return _GCSV.index(name), scale * unit
 
 
-def _orientation(path: Path, letters: str) -> Array:
-    """(3, 3) matrix from the axes of a gyroflow log to gyroflow's."""
+def _orientation(path: Path, letters: str) -> tuple[list[int], list[float]]:
+    """Which axis of a gyroflow log is gyroflow's x, y and z, and its sign."""
     if sorted(letters.lower()) != ["x", "y", "z"]:
         raise InputError(f'IMU file {path} has the orientation "{letters}"; x, y and z in any order are expected')
-    axes = np.zeros((3, 3))
-    for row, letter in enumerate(letters):
-        axes[row, "xyz".index(letter.lower())] = 1.0 if letter.isupper() else -1.0
-    return axes
+    return ["xyz".index(letter.lower()) for letter in letters], [
+        1.0 if letter.isupper() else -1.0 for letter in letters
+    ]
 
 
 def _samples(path: Path, skip: int, columns: list[int], count: int) -> Array:

@@ -14,6 +14,7 @@ Array = NDArray[np.float64]
 
 GRAVITY = 9.81  # m/s^2
 
+_LARGEST = 1e12  # of a number: its square stays finite
 _LOWEST_RATE = 50.0  # samples per second
 _LONGEST_GAP = 0.1  # seconds: interpolated over more, a hand's motion is lost
 _LARGEST_TURN = 10.0  # rad/s, median: no camera turns so fast for half of a shot, but one in degrees does
@@ -125,9 +126,10 @@ def _checked(name: str, values: Array, shape: tuple[int, ...]) -> Array:
         raise InputError(f'"{name}" of an IMU holds what is no number') from error
     if array.shape != shape:
         raise InputError(f'"{name}" of an IMU has the shape {array.shape}; {shape} is expected')
-    if not np.isfinite(array).all():
-        where = int(np.argwhere(~np.isfinite(array))[0, 0])
-        raise InputError(f'"{name}" of an IMU is not finite in row {where}')
+    usable = np.abs(array) < _LARGEST  # NaN is not
+    if not usable.all():
+        where = tuple(np.argwhere(~usable)[0])
+        raise InputError(f'"{name}" of an IMU is {array[where]:g} in row {where[0]}; a finite number is expected')
     return array
 
 

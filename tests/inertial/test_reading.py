@@ -99,7 +99,14 @@ def test_scales_of_gyroflow_have_defaults(tmp_path):
         (f"{NAMES}\n0,0,0,0,0,9.8,0\n\n0.01,0,zero,0,0,9.8,0\n".encode(), "line 4 of IMU file .* holds 'zero'"),
         (f"{NAMES}\n0,0,0,,0,9.8,0\n".encode(), "line 2 of IMU file .* holds ''; a number is expected"),
         (f"{NAMES}\n0,0,0,0,0,9.8,0\n\xff\n".encode("latin-1"), "is no text"),
-        (f"{NAMES}\n0,0,0,0,0,9.8,0\n0.01,nan,0,0,0,9.8,0\n".encode(), '"gyroscope" of an IMU is not finite in row 1'),
+        (
+            f"{NAMES}\n0,0,0,0,0,9.8,0\n0.01,nan,0,0,0,9.8,0\n".encode(),
+            '"gyroscope" of an IMU is nan in row 1; a finite number',
+        ),
+        (
+            f"{NAMES}\n0,0,0,0,1e308,9.8,0\n0.01,0,0,0,0,9.8,0\n".replace("accel_x", "accel_x_g").encode(),
+            "is inf in row 0",
+        ),
         (f"{NAMES}\n0,0,0,0,0,9.8,0\n".encode(), "has 1 samples; at least 2"),
         (gcsv("XYY").encode(), 'has the orientation "XYY"; x, y and z in any order are expected'),
         (gcsv(columns="t,gx,gy,gz").encode(), "has no column ax, ay, az"),

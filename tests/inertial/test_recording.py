@@ -24,7 +24,11 @@ def test_a_resting_imu_is_accepted():
     [
         ({"gyroscope": np.zeros((99, 3))}, r'"gyroscope" of an IMU has the shape \(99, 3\); \(100, 3\) is expected'),
         ({"accelerometer": [["a", "b", "c"]] * 100}, '"accelerometer" of an IMU holds what is no number'),
-        ({"gyroscope": np.full((100, 3), np.nan)}, '"gyroscope" of an IMU is not finite in row 0'),
+        ({"gyroscope": np.full((100, 3), np.nan)}, '"gyroscope" of an IMU is nan in row 0; a finite number'),
+        (
+            {"accelerometer": np.full((100, 3), 1e200)},
+            '"accelerometer" of an IMU is 1e\\+200 in row 0; a finite number',
+        ),
         ({"time": TIME[::-1]}, r"the time of an IMU goes from 0.990000 to 0.980000 s in row 1; it must ascend"),
         ({"time": 3 * TIME}, "an IMU recorded 33.3 samples a second; at least 50 are needed"),
         ({"time": TIME + 0.2 * (TIME > 0.5)}, r"a gap of 0.21 s at 0.500 s; at most 0.1 s can be bridged"),
