@@ -17,6 +17,8 @@ from factorsfm.frames.raw import RawFormat
 from factorsfm.frames.reading import read_frames
 from factorsfm.graph.explicit_graph import factor_graph
 from factorsfm.imagesets.add_images import add_images
+from factorsfm.inertial.reading import read_imu
+from factorsfm.inertial.recording import ImuNoise, ImuRecording
 from factorsfm.polish.observability import CameraObservability
 from factorsfm.priors.depth import DepthFolder, DepthModel, DepthPrior
 from factorsfm.priors.depth_map import DepthKind, DepthMap
@@ -52,6 +54,8 @@ __all__ = [
     "FrameResult",
     "FrameStatus",
     "FrameUpdate",
+    "ImuNoise",
+    "ImuRecording",
     "InputError",
     "KnownDistance",
     "KnownHeight",
@@ -84,6 +88,7 @@ __all__ = [
     "read_camera",
     "read_control",
     "read_frames",
+    "read_imu",
     "read_result",
     "reconstruct",
     "track",

@@ -1,8 +1,10 @@
-"""Synthetic shots with exact truth: projected points, and a rendered room.
+"""Synthetic shots with exact truth: projected points, a rendered room, and an IMU.
 
-Takes a camera motion, gives observations or images with poses and depth. May import `camera` and what lies below it.
+Takes a camera motion, gives observations, images with poses and depth, or the samples of an IMU. May import `inertial`
+and what lies below it.
 """
 
+from factorsfm.synthetic.imu import SmoothPath, handheld_path, simulate_imu
 from factorsfm.synthetic.rolling import read_by_rows
 from factorsfm.synthetic.scene import Motion, SyntheticScene, room_camera, synthetic_scene
 from factorsfm.synthetic.shot import (
@@ -16,11 +18,14 @@ from factorsfm.synthetic.shot import (
 __all__ = [
     "Motion",
     "RenderedShot",
+    "SmoothPath",
     "SyntheticScene",
+    "handheld_path",
     "read_by_rows",
     "render_shot",
     "render_views",
     "room_camera",
+    "simulate_imu",
     "simulate_prior",
     "synthetic_scene",
     "write_shot",
