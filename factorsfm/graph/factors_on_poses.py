@@ -64,15 +64,15 @@ class FactorsOnPoses:
         return information, gradient
 
     def errors(self, rotation: Array, translation: Array, points: Array) -> list[tuple[str, float]]:
-        """Of each factor what it is on, and its error in standard deviations (root of twice its cost)."""
+        """Of each factor what it is on, and its error in standard deviations, the root mean square of its rows."""
         values = self._best(self._at(rotation, translation, points))
         factors = [self._graph.at(k) for k in range(self._graph.size())]
         return [
             (
-                f"{type(f).__name__} on {', '.join(map(name_of, f.keys()))}",
-                float(np.sqrt(2.0 * max(f.error(values), 0.0))),
+                f"{type(factor).__name__} on {', '.join(map(name_of, factor.keys()))}",
+                float(np.sqrt(2.0 * max(factor.error(values), 0.0) / factor.dim())),
             )
-            for f in factors
+            for factor in factors
         ]
 
     def _at(self, rotation: Array, translation: Array, points: Array) -> gtsam.Values:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from factorsfm.graph.added_factors import NOTHING_ADDED, AddedFactors
@@ -46,12 +46,13 @@ class Additions:
         self._following += len(added.numbers)
         self.offered.append(added)
 
+    def present(self) -> AddedFactors:
+        """What is active, and what waits."""
+        return _joined([self.active, *self.offered])
+
     def everything(self) -> AddedFactors:
         """All factors, as they were given, those included that wait."""
-        added = NOTHING_ADDED
-        for batch in (*self.taken, *self.offered):
-            added = added.joined(batch)
-        return added
+        return _joined([*self.taken, *self.offered])
 
     def follow(self, update: MapUpdate) -> str:
         """Take over what an update made of the factors; a sentence where that is out of the ordinary."""
@@ -67,3 +68,10 @@ class Additions:
         if update.unit == 1.0:
             return ""
         return f"the factors added set the unit of length: lengths are now {update.unit:.4g} times as long"
+
+
+def _joined(batches: Sequence[AddedFactors]) -> AddedFactors:
+    added = NOTHING_ADDED
+    for batch in batches:
+        added = added.joined(batch)
+    return added

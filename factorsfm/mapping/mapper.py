@@ -176,11 +176,16 @@ class Mapper(IncrementalMapper):
             if hurry:
                 self._take_over()
 
-    def finish(self) -> None:
-        """No more images: start with what there is, if nothing better came; all images on the map as it is at last."""
+    def finish(self, last_factors: Callable[[], None] = lambda: None) -> None:
+        """No more images: start with what there is, if nothing better came; all images on the map as it is at last.
+
+        Args:
+            last_factors: may add factors to the map as the last keyframe left it.
+        """
         self._take_over()
         if not self.started:
             self._begin(self._starter.last_resort(self._waiting(), self.focal))
+        last_factors()
         if self.additions.offered:  # no update will take them: the polish does
             self._rescale(unit_of_length(self.additions.everything(), self.contents())[0])
         self.refresh()

@@ -22,6 +22,7 @@ from factorsfm.priors.depth import DepthPrior
 from factorsfm.result.assembly import assemble
 from factorsfm.result.reconstruction import Reconstruction
 from factorsfm.streaming.frame_update import SeenFrame
+from factorsfm.streaming.imu_source import ImuSource
 from factorsfm.support.errors import ReconstructionError
 from factorsfm.support.options import Options
 from factorsfm.support.progress import Progress
@@ -37,7 +38,7 @@ class EndedShot:
         colors: (n, 3) RGB by track id.
         camera: the lens of the mapper's images; lens_given: whether it is known, and no guess.
         depth: the prior; without_depth: why it failed, by the frame's index.
-        control: what is known beforehand.
+        control: what is known beforehand; imu: beside the stream.
         seconds: of the stages so far; that of the polish is added.
     """
 
@@ -49,6 +50,7 @@ class EndedShot:
     depth: DepthPrior | None
     without_depth: Mapping[int, str]
     control: Control | None
+    imu: ImuSource | None
     options: Options
     seconds: StageSeconds
 

@@ -21,6 +21,7 @@ from factorsfm.frames.frame import Frame, as_frame
 from factorsfm.frames.texture import BLANK_TEXTURE
 from factorsfm.graph.contents import Factors, LiveGraph, Values, empty_graph
 from factorsfm.graph.process import GraphProcess
+from factorsfm.inertial.recording import ImuRecording
 from factorsfm.lens.camera_model import distortion_of
 from factorsfm.mapping.mapper import Mapper
 from factorsfm.priors.depth import DepthPrior
@@ -31,6 +32,7 @@ from factorsfm.report.thumbnails import Thumbnails
 from factorsfm.result.reconstruction import Reconstruction
 from factorsfm.streaming.finishing import EndedShot
 from factorsfm.streaming.frame_update import FrameUpdate, SeenFrame, frame_results, frame_update, pose_of
+from factorsfm.streaming.imu_source import ImuSource, frame_times
 from factorsfm.streaming.snapshot import read_snapshot, write_snapshot
 from factorsfm.streaming.view_finder import ViewFinder
 from factorsfm.support.context import Closing
@@ -60,6 +62,8 @@ class Stream(Closing):
         masks: what to ignore, or None.
         options: see `Options`; None is the default preset.
         control: what is known beforehand of poses and points; it takes part in `finish`. Not part of snapshots.
+        imu: recording of an IMU on the camera, which gives metric scale and gravity; the frames need times. With it the
+            letters v, b and g of variables are taken.
 
     Example:
         >>> stream = factorsfm.Stream(camera, depth=factorsfm.DepthModel("model.onnx"))  # doctest: +SKIP
@@ -76,8 +80,12 @@ class Stream(Closing):
         masks: MaskPrior | None = None,
         options: Options | None = None,
         control: Control | None = None,
+        imu: ImuRecording | None = None,
     ) -> None:
+        if control is not None and imu is not None:
+            raise InputError("control and an IMU cannot both set the scale; give one of them")
         self.camera = camera
+        self._imu = ImuSource(imu) if imu is not None else None
         self._lens_given = camera is not None
         self.control = control
         self.options = options or Options()
@@ -133,7 +141,12 @@ class Stream(Closing):
         )
         tracks = tracks.of(tracks.invertible & (tracked.texture >= BLANK_TEXTURE))  # a blank image's tracks are noise
         with self.seconds.of("mapping"):
+            if self._imu is not None:
+                times = frame_times([*(seen.timestamp for seen in self.frames), frame.timestamp])
+                keyframe = keyframe or self._imu.wants_keyframe(mapper, times)
             image = mapper.add(tracks, lambda: self._read_depth(frame, tracks.pixels), keyframe=keyframe)
+            if self._imu is not None:
+                self._imu.follow(mapper, times)
         focal_changed |= self._follow_focal(mapper)
         self.frames.append(SeenFrame(frame.index, frame.name, frame.timestamp, tracked.texture))
         self._thumbnails.add(frame.image)
@@ -294,7 +307,7 @@ class Stream(Closing):
         if self._mapper is None or len(self.frames) < 2:
             raise ReconstructionError(f"frames in the shot: {len(self.frames)}, at least 2 needed")
         with self.seconds.of("mapping"):
-            self._mapper.finish()
+            self._mapper.finish(self._follow_imu)
         self._follow_focal(self._mapper)
         for position, seen in enumerate(self.frames):
             _mark_blank(self._mapper, position, seen.texture)
@@ -308,9 +321,14 @@ class Stream(Closing):
             depth=self._depth,
             without_depth=self._without_depth,
             control=self.control,
+            imu=self._imu,
             options=self.options,
             seconds=self.seconds,
         )
+
+    def _follow_imu(self) -> None:
+        if self._imu is not None and self._mapper is not None and self._mapper.started:
+            self._imu.follow(self._mapper, frame_times([seen.timestamp for seen in self.frames]), finished=True)
 
     def close(self) -> None:
         """End all threads and processes of the stream, with a result or without; `finish` closes, too."""

@@ -242,7 +242,7 @@ def test_the_quadratic_has_the_gradient_and_the_curvature_of_the_least_cost():
     assert direction @ information @ direction == pytest.approx(curvature, rel=2e-2)
     names = dict(on_poses.errors(*at(np.zeros(size))))
     assert names["BetweenFactorPose3 on x0, x1"] == pytest.approx(
-        np.sqrt(2 * graph.at(0).error(values_of_poses(off))), rel=1e-6
+        np.sqrt(2 * graph.at(0).error(values_of_poses(off)) / 6), rel=1e-6
     )
 
 

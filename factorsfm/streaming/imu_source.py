@@ -1,0 +1,156 @@
+"""An IMU beside a stream: its factors enter the live graph when the motion shows its clock, its axes and the scale."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorsfm.graph.inertial_chain import first_inertial_factors, inertial_state, next_inertial_factor
+from factorsfm.inertial.alignment import VisualPoses, align_inertial
+from factorsfm.inertial.recording import ImuRecording
+from factorsfm.inertial.timing import ImuTiming, fit_timing
+from factorsfm.mapping.mapped_images import MappedImage
+from factorsfm.mapping.mapper import Mapper
+from factorsfm.support.errors import FactorsfmError, InputError
+
+Array = NDArray[np.float64]
+
+logger = logging.getLogger(__name__)
+
+_FIRST_SECONDS, _FIRST_KEYFRAMES = 2.0, 8  # before which the motion hardly determines anything
+_AGAIN_SECONDS = 0.5  # after an attempt that failed
+_MOST_KEYFRAMES = 30  # of the alignment, the newest ones
+_LEAST_INTERVAL, _LONGEST_INTERVAL = 0.15, 0.5  # seconds between keyframes with a factor, and between keyframes at all
+_LARGEST_SCALE_STD = 0.05  # of the logarithm, with which the factors begin
+_EXACT = 1e-12  # variance of the pose of the first keyframe, which is the world
+
+
+class ImuSource:
+    """Factors from a recording, added to the graph of a mapper.
+
+    Args:
+        recording: what is unknown of its clock and axes is estimated.
+
+    Attributes:
+        timing: the fit of its clock and axes, once there is one.
+        reason: why it takes no part yet, empty while it does.
+    """
+
+    def __init__(self, recording: ImuRecording) -> None:
+        self._given = recording
+        self.timing: ImuTiming | None = None
+        self.reason = "the video has not begun"
+        self._last: int | None = None  # position of the newest keyframe with a factor
+        self._attempt = -np.inf  # time of the last one to begin
+        self._seen = 0  # keyframes of the map so far
+
+    @property
+    def recording(self) -> ImuRecording:
+        """With clock and axes as far as they are known."""
+        return self._given if self.timing is None else self.timing.applied(self._given)
+
+    @property
+    def takes_part(self) -> bool:
+        """Whether its factors are in the graph, or wait for the next update."""
+        return self._last is not None
+
+    def wants_keyframe(self, mapper: Mapper, times: Sequence[float]) -> bool:
+        """Whether the newest frame shall be a keyframe, since the last one is long ago."""
+        last = [image.tracks.position for image in mapper.images if image.keyframe][-1:]
+        return bool(last) and times[-1] - times[last[0]] >= _LONGEST_INTERVAL
+
+    def follow(self, mapper: Mapper, times: Sequence[float], *, finished: bool = False) -> None:
+        """After a frame: begin, or go on with the keyframes that the map has taken over since.
+
+        Args:
+            times: (n,) seconds of the frames of the mapper; finished: whether no more come.
+        """
+        if mapper.starts_anew:
+            self._last, self.reason = None, "the map was started anew"
+        if len(mapper.keyframes) == self._seen and not finished:
+            return
+        self._seen = len(mapper.keyframes)
+        if self._last is not None and not self._is_known(mapper):
+            self._last, self.reason = None, "the images contradict its factors"
+        try:
+            if self._last is None:
+                self._begin(mapper, times, finished)
+            if self._last is not None:
+                self._go_on(mapper, times)
+        except FactorsfmError as error:
+            self.reason = str(error)
+            logger.debug("IMU: %s", error)
+
+    def _is_known(self, mapper: Mapper) -> bool:
+        """Whether the factors of the last keyframe are in the graph, or wait."""
+        assert self._last is not None
+        frame = mapper.images[self._last].tracks.frame
+        return inertial_state(mapper.additions.present(), frame) is not None
+
+    def _begin(self, mapper: Mapper, times: Sequence[float], finished: bool) -> None:
+        positions = _spaced(mapper.keyframes, times)[-_MOST_KEYFRAMES:]
+        span = times[positions[-1]] - times[mapper.keyframes[0]] if positions else 0.0
+        early = len(positions) < _FIRST_KEYFRAMES or span < _FIRST_SECONDS
+        if not finished and (early or times[-1] - self._attempt < _AGAIN_SECONDS):
+            self.reason = f"{len(positions)} keyframes in {span:.1f} s are too few to find its scale"
+            return
+        self._attempt = times[-1]
+        self.timing = fit_timing(self._given, np.array(times), _rotations(mapper.images))
+        images = [mapper.images[position] for position in positions]
+        time = np.array([times[position] for position in positions])
+        alignment = align_inertial(self.recording, _visual_poses(images, time))
+        if alignment.log_scale_sigma > _LARGEST_SCALE_STD and not finished:
+            raise InputError(f"the motion shows the scale to {100 * alignment.log_scale_sigma:.1f} % so far")
+        frames = [image.tracks.frame for image in images]
+        mapper.add_factors(*first_inertial_factors(self.recording, frames, time, alignment))
+        self._last, self.reason = positions[-1], ""
+
+    def _go_on(self, mapper: Mapper, times: Sequence[float]) -> None:
+        assert self._last is not None
+        for position in _spaced(mapper.keyframes, times):
+            if times[position] - times[self._last] < _LEAST_INTERVAL:
+                continue
+            before, after = mapper.images[self._last], mapper.images[position]
+            state = inertial_state(mapper.additions.present(), before.tracks.frame)
+            assert state is not None
+            frames, time = (before.tracks.frame, after.tracks.frame), (times[self._last], times[position])
+            mapper.add_factors(*next_inertial_factor(self.recording, frames, time, before.pose, state))
+            self._last = position
+
+
+def frame_times(timestamps: Sequence[float | None]) -> list[float]:
+    """Times of frames, seconds.
+
+    Raises:
+        InputError: a frame has none.
+    """
+    times = [time for time in timestamps if time is not None]
+    if len(times) < len(timestamps):
+        missing = next(k for k, time in enumerate(timestamps) if time is None)
+        raise InputError(f"frame {missing} has no time; an IMU needs those of all frames, as a video file has them")
+    return times
+
+
+def _spaced(keyframes: Sequence[int], times: Sequence[float]) -> list[int]:
+    """Keyframes that are not too close to each other, the last ones first chosen, in order of time."""
+    chosen: list[int] = []
+    for position in reversed(keyframes):
+        if not chosen or times[chosen[-1]] - times[position] >= _LEAST_INTERVAL:
+            chosen.append(position)
+    return chosen[::-1]
+
+
+def _rotations(images: Sequence[MappedImage]) -> Array:
+    """(n, 3, 3) world_from_cam, NaN where an image has none."""
+    return np.array([image.pose[0].T if image.registered else np.full((3, 3), np.nan) for image in images])
+
+
+def _visual_poses(images: Sequence[MappedImage], time: Array) -> VisualPoses:
+    rotations = _rotations(images)
+    centers = np.array([-image.pose[0].T @ image.pose[1] for image in images])
+    exact = _EXACT * np.eye(6)
+    covariance = np.array([exact if image.covariance is None else image.covariance for image in images])
+    return VisualPoses(time, rotations, centers, covariance)
