@@ -17,7 +17,8 @@ from factorsfm.frames.raw import RawFormat
 from factorsfm.frames.reading import read_frames
 from factorsfm.graph.explicit_graph import factor_graph
 from factorsfm.imagesets.add_images import add_images
-from factorsfm.inertial.reading import read_imu
+from factorsfm.inertial.fit import ImuFit
+from factorsfm.inertial.mounting import open_imu
 from factorsfm.inertial.recording import ImuNoise, ImuRecording
 from factorsfm.polish.observability import CameraObservability
 from factorsfm.priors.depth import DepthFolder, DepthModel, DepthPrior
@@ -54,6 +55,7 @@ __all__ = [
     "FrameResult",
     "FrameStatus",
     "FrameUpdate",
+    "ImuFit",
     "ImuNoise",
     "ImuRecording",
     "InputError",
@@ -84,11 +86,11 @@ __all__ = [
     "factor_graph",
     "find_shots",
     "guess_camera",
+    "open_imu",
     "open_source",
     "read_camera",
     "read_control",
     "read_frames",
-    "read_imu",
     "read_result",
     "reconstruct",
     "track",

@@ -21,6 +21,8 @@ from factorsfm.frames.reading import read_frames
 from factorsfm.frames.unordered import looks_unordered, other_files, read_images
 from factorsfm.imagesets.image_set import ImageSet
 from factorsfm.imagesets.photo_folder import work_folder
+from factorsfm.inertial.mounting import open_imu
+from factorsfm.inertial.recording import ImuRecording
 from factorsfm.priors.depth import DepthFolder, DepthPrior, open_depth
 from factorsfm.priors.depth_map import DepthKind
 from factorsfm.priors.masks import MaskFolder, MaskPrior, open_masks
@@ -46,6 +48,7 @@ def reconstruct(
     features: str | Path = "sift",
     work: str | Path | None = None,
     control: str | Path | Control | None = None,
+    imu: str | Path | ImuRecording | None = None,
     progress: Progress | None = None,
 ) -> Reconstruction:
     """Camera path, lens and sparse points of one shot, or of a set of photographs.
@@ -70,6 +73,7 @@ def reconstruct(
         work: folder for the features and matches of a set, from which an interrupted run goes on; None keeps nothing.
         control: what is known beforehand of poses, points, distances and heights, or its JSON file; the result is in
             the world and unit of the control then.
+        imu: recording of an IMU on the camera of a video, or its file (`open_imu`); the result is metric then.
         progress: called with the stage, the frames done, and their number where it is known.
 
     Raises:
@@ -85,13 +89,16 @@ def reconstruct(
     prior = open_depth(depth, depth_kind) if options.uses_depth else None
     mask_prior = open_masks(masks)
     known = read_control(control) if isinstance(control, str | Path) else control
+    recording = open_imu(imu) if isinstance(imu, str | Path) else imu
     _check_control(known, source, frames)
     if unordered is None:
         unordered = isinstance(source, str | Path) and looks_unordered(Path(source), frames)
+    if unordered and recording is not None:
+        raise InputError("an IMU goes with a video; images in any order have no times")
     if unordered:
         result = _from_images(source, frames, camera, prior, mask_prior, options, known, features, work, progress)
     else:
-        result = _from_shot(source, frames, camera, prior, mask_prior, options, known, progress)
+        result = _from_shot(source, frames, camera, prior, mask_prior, options, known, recording, progress)
     said = {
         "source": str(source) if isinstance(source, str | Path) else "frames",
         "unordered": unordered,
@@ -134,9 +141,10 @@ def _from_shot(
     masks: MaskPrior | None,
     options: Options,
     control: Control | None,
+    imu: ImuRecording | None,
     progress: Progress | None,
 ) -> Reconstruction:
-    with Stream(camera, depth=depth, masks=masks, options=options, control=control) as stream:
+    with Stream(camera, depth=depth, masks=masks, options=options, control=control, imu=imu) as stream:
         for done, frame in enumerate(read_frames(source, frames)):
             if progress is not None:
                 progress("frames", done, None)

@@ -48,6 +48,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="known poses, points, distances and heights: the result is in their world and unit",
     )
     parser.add_argument(
+        "--imu",
+        type=Path,
+        metavar="FILE",
+        help="recording of an IMU on the camera (CSV, .gcsv, or a JSON file that names one): the result is metric",
+    )
+    parser.add_argument(
         "--work",
         type=Path,
         metavar="DIR",
@@ -75,6 +81,7 @@ def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
             features=arguments.features,
             work=arguments.work,
             control=arguments.control,
+            imu=arguments.imu,
             progress=progress,
         )
     except ReconstructionError as error:

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import L, X
 from numpy.typing import NDArray
 
-from factorsfm.graph.added_factors import AddedFactors, MapValues, held_prior, keys_of, name_of, part_of, present_values
+from factorsfm.graph.added_factors import (
+    HELD,
+    AddedFactors,
+    MapValues,
+    held_prior,
+    keys_of,
+    name_of,
+    part_of,
+    present_values,
+)
 from factorsfm.graph.factors import pose_from_camera
 
 Array = NDArray[np.float64]
@@ -74,6 +83,25 @@ class FactorsOnPoses:
             )
             for factor in factors
         ]
+
+    def with_poses(
+        self, poses: Mapping[int, tuple[tuple[Array, Array], Array | None]]
+    ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+        """The factors with priors of the poses that they name, and values of all variables; a copy.
+
+        Args:
+            poses: `cam_from_world` and covariance (6, 6) by frame.
+        """
+        graph, values = gtsam.NonlinearFactorGraph(self._graph), gtsam.Values(self._own)
+        named = {self._keys[row] for row in self._named}
+        for frame, (camera, covariance) in poses.items():
+            if (key := X(frame)) in named:
+                spread = (0.0 if covariance is None else covariance) + HELD**2 * np.eye(6)
+                values.insert_or_assign(key, pose_from_camera(*camera))
+                graph.add(
+                    gtsam.PriorFactorPose3(key, values.atPose3(key), gtsam.noiseModel.Gaussian.Covariance(spread))
+                )
+        return graph, values
 
     def _at(self, rotation: Array, translation: Array, points: Array) -> gtsam.Values:
         values = gtsam.Values()

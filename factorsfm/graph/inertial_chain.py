@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from factorsfm.graph.added_factors import AddedFactors
 from factorsfm.graph.contents import LiveGraph, empty_graph
 from factorsfm.graph.factors import pose_from_camera
+from factorsfm.graph.factors_on_poses import FactorsOnPoses
 from factorsfm.graph.inertial_factors import inertial_factor, inertial_graph, preintegrated
 from factorsfm.inertial.alignment import InertialAlignment
 from factorsfm.inertial.recording import ImuRecording
@@ -80,3 +81,21 @@ def inertial_state(added: AddedFactors, frame: int) -> InertialState | None:
     return InertialState(
         values.atVector(V(frame)), values.atPoint3(GRAVITY_KEY), bias.gyroscope(), bias.accelerometer()
     )
+
+
+def posterior_state(
+    factors: FactorsOnPoses, poses: Mapping[int, tuple[tuple[Array, Array], Array | None]]
+) -> tuple[InertialState, float]:
+    """The IMU's variables beside solved poses, at the first keyframe, and the std of gravity's direction, radians.
+
+    Args:
+        poses: `cam_from_world` and covariance (6, 6) by frame; the errors of different frames count as independent.
+    """
+    graph, values = factors.with_poses(poses)
+    solved = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    first = min(gtsam.symbolIndex(key) for key in list(solved.keys()) if key == B(gtsam.symbolIndex(key)))
+    bias, gravity = solved.atConstantBias(B(first)), solved.atPoint3(GRAVITY_KEY)
+    covariance = gtsam.Marginals(graph, solved).marginalCovariance(GRAVITY_KEY)
+    across = np.eye(3) - np.outer(gravity, gravity) / (gravity @ gravity)
+    std = float(np.sqrt(np.linalg.eigvalsh(across @ covariance @ across)[-1]) / np.linalg.norm(gravity))
+    return InertialState(solved.atVector(V(first)), gravity, bias.gyroscope(), bias.accelerometer()), std

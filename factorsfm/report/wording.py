@@ -17,6 +17,7 @@ _STATUS = {
     "registered": "solved",
     "lost": "the view is not in the map",
     "static": "solved, camera at rest",
+    "inertial": "posed by the IMU",
     "too_few_tracks": "too little to track",
     "too_few_inliers": "tracks contradict the scene",
     "blank": "blank or out of focus",

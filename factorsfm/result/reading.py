@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from factorsfm.camera.files import camera_from_json, camera_to_json
 from factorsfm.camera.projection import PIXEL_CENTER
 from factorsfm.control.fit import ControlFit
+from factorsfm.inertial.fit import ImuFit
 from factorsfm.polish.observability import CameraObservability
 from factorsfm.result.reconstruction import FrameResult, LensFit, PriorFit, Reconstruction, RollingShutter
 from factorsfm.result.summary import part_name
@@ -56,6 +57,7 @@ class _Summary:
     parallax: float
     metric: bool
     control: ControlFit | None
+    imu: ImuFit | None
     notes: list[str]
     seconds: dict[str, float]
     options: dict[str, Any]
@@ -135,6 +137,7 @@ def _reconstruction(summary: _Summary, model: pycolmap.Reconstruction) -> Recons
         shutter=summary.shutter,
         metric=summary.metric,
         control=summary.control,
+        imu=summary.imu,
         notes=summary.notes,
         seconds=summary.seconds,
         options=summary.options,

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     import pycolmap
 from factorsfm.control.fit import ControlFit
+from factorsfm.inertial.fit import ImuFit
 from factorsfm.polish.observability import CameraObservability
 from factorsfm.support.status import FrameStatus, ShotKind
 
@@ -146,7 +147,8 @@ class Reconstruction:
         lens: how well the lens is known, None if it was given.
         shutter: the rolling shutter, None if none was found.
         metric: whether the world unit is the metre (from a metric prior, or from control).
-        control: how well the control is met, None without control.
+        control: how well the control is met, or factors that were added; None without either.
+        imu: what an IMU has given, None without one that took part.
         notes: sentences for the user (translation unobservable, focal length guessed, ...).
         seconds: wall time by stage.
         options: all options as plain data.
@@ -170,6 +172,7 @@ class Reconstruction:
     shutter: RollingShutter | None = None
     metric: bool = False
     control: ControlFit | None = None
+    imu: ImuFit | None = None
     notes: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
     options: dict[str, Any] = field(default_factory=dict)

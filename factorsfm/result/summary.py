@@ -33,6 +33,7 @@ def summary(reconstruction: Reconstruction) -> dict[str, Any]:
         "kind": reconstruction.kind,
         "metric": reconstruction.metric,
         "control": reconstruction.control and asdict(reconstruction.control),
+        "imu": reconstruction.imu and asdict(reconstruction.imu),
         "reprojection_error": median_reprojection_error(reconstruction),
         "observability": pooled_observability(reconstruction),
         "focal_length": reconstruction.camera.mean_focal_length(),

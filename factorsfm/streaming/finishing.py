@@ -22,6 +22,7 @@ from factorsfm.priors.depth import DepthPrior
 from factorsfm.result.assembly import assemble
 from factorsfm.result.reconstruction import Reconstruction
 from factorsfm.streaming.frame_update import SeenFrame
+from factorsfm.streaming.imu_result import add_imu
 from factorsfm.streaming.imu_source import ImuSource
 from factorsfm.support.errors import ReconstructionError
 from factorsfm.support.options import Options
@@ -64,8 +65,9 @@ class EndedShot:
                 f"{registered} of {len(self.frames)} frames registered, at least 2 needed; "
                 f"frame {self.frames[worst.tracks.position].index}: {worst.message}"
             )
+        factors = self._factors()
         with self.seconds.of("polish"):
-            polished = self._polished(control, progress)
+            polished = self._polished(control, factors, progress)
         result = assemble(
             polished,
             self.mapper.images,
@@ -80,11 +82,17 @@ class EndedShot:
         if self.without_depth:
             count, first = len(self.without_depth), next(iter(self.without_depth.values()))
             result.notes.append(f"Frames that went without depth because the prior failed: {count}; {first}.")
+        if self.imu is not None:
+            on_poses = None if factors is None else factors.on_poses(polished.frames, [])
+            assert on_poses is None or isinstance(on_poses, FactorsOnPoses)
+            add_imu(result, self.imu, on_poses)
         if self.mapper.without_prior:
             result.notes.append(f"The map went on without the depth prior: {self.mapper.without_prior}.")
         return result
 
-    def _polished(self, control: LocatedControl | None, progress: Progress | None) -> Polished:
+    def _polished(
+        self, control: LocatedControl | None, factors: ShotFactors | None, progress: Progress | None
+    ) -> Polished:
         return polish(
             self.mapper.images,
             self.mapper.points.all(),
@@ -93,7 +101,7 @@ class EndedShot:
             lambda stage: progress(stage, 0, None) if progress else None,
             distortion_of(self.camera) if self.options.estimates_lens else None,
             control=control,
-            factors=self._factors(),
+            factors=factors,
             first_focal=(np.array([self.mapper.first_focal]), first_focal_std(self.camera, given=self.lens_given)),
             recording=self._recording(),
         )

@@ -10,6 +10,7 @@ class FrameStatus(StrEnum):
 
     REGISTERED = "registered"
     STATIC = "static"  # registered; the camera has not moved measurably since the first frame
+    INERTIAL = "inertial"  # the image shows nothing; the pose is the IMU's
     TOO_FEW_TRACKS = "too_few_tracks"
     TOO_FEW_INLIERS = "too_few_inliers"
     LOST = "lost"  # the image shows nothing that is in the map
