@@ -29,7 +29,9 @@ class Polished:
     Attributes:
         frames: (k,) positions of the images in `state`; tracks: (n,) track of each point.
         errors: (m,) reprojection errors of `observations` (pixels); sigma: their standard deviation.
-        covariance: (k, 6, 6) of the poses, GTSAM's convention, `in_scene_unit`.
+        observation_sigma, track_sigma: see `BundleAdjustment.observation_sigmas`.
+        covariance: (k, 6, 6) of the poses, GTSAM's convention, `in_scene_unit`; relative_covariance: of each
+            relative to the one before.
         observability: of the pose of each camera.
         point_std: (n,) standard deviations of the inverse distances, in the same unit.
         left_out: why, of the registered images that have no pose here.
@@ -46,8 +48,11 @@ class Polished:
     observations: Observations
     errors: Array
     sigma: float
+    observation_sigma: Array
+    track_sigma: Array
     motion: Motion
     covariance: Array
+    relative_covariance: Array
     observability: list[CameraObservability]
     point_std: Array
     left_out: dict[int, str]
@@ -68,5 +73,5 @@ class Polished:
         if self.prior is None:
             return
         std = np.sqrt(camera_covariance.diagonal())
-        self.prior.residual = adjustment.prior_residuals()
+        self.prior.residual, self.prior.residual_sigma = adjustment.prior_residuals()
         self.prior.scale_std, self.prior.shift_std = std[adjustment.columns.scales], std[adjustment.columns.shifts]
