@@ -109,9 +109,10 @@ def factor_graph(reconstruction: SolvedShot) -> tuple[gtsam.NonlinearFactorGraph
     camera only turns or stands, all positions are that of the first. Control has no factors.
 
     What was observed weighs what it weighs in the polish, and the values are those of the minimum: Levenberg-Marquardt
-    stays within a tenth of the standard deviations of the poses. Poses that were fitted to images with a rolling
-    shutter (`RollingShutter.recorded`) are no minimum. Once the unit is fixed, the standard deviations are those of
-    `FrameResult.covariance`, or smaller where a prior decides: its values are those without its smooth error.
+    stays within a tenth of the standard deviations of the poses, within four tenths where weak priors of the polish
+    decide for lack of parallax. Poses that were fitted to images with a rolling shutter (`RollingShutter.recorded`) are
+    no minimum. Once the unit is fixed, the standard deviations are those of `FrameResult.covariance`, or up to a tenth
+    smaller where the depth prior decides: its values are those without its smooth error.
 
     Where the noise is unknown (`Reconstruction.noise`), the observations have a Cauchy kernel and the size of their
     residuals, and there is no prior.

@@ -54,7 +54,7 @@ def assert_same(r: Reconstruction, frames: list[int] | None) -> None:
     expected = eliminated(r, at)
     size = np.sqrt(np.diag(expected))
     found = factor.factor().augmentedInformation()
-    np.testing.assert_allclose(found / np.outer(size, size), expected / np.outer(size, size), atol=1e-7)
+    np.testing.assert_allclose(found / np.outer(size, size), expected / np.outer(size, size), atol=1e-9)
 
 
 def test_a_measurement_has_the_same_effect_as_in_the_full_graph() -> None:
