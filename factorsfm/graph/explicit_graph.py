@@ -94,6 +94,8 @@ class SolvedShot(Protocol):
     @property
     def noise(self) -> Noise | None: ...
     @property
+    def rolled(self) -> Array | None: ...
+    @property
     def camera(self) -> pycolmap.Camera: ...
     def camera_of(self, frame: Any, /) -> pycolmap.Camera: ...
 
@@ -105,14 +107,15 @@ def factor_graph(reconstruction: SolvedShot) -> tuple[gtsam.NonlinearFactorGraph
     `track_ids` j, the affine ``A(i)`` of that frame's depth prior (`factors.affine_of_native`), and the constant
     ``T(0)``; the principal point of the calibration ``K(n)`` is the error that a track keeps for 16 registered frames
     (`ObservationNoise.track`). Projections are undistorted pixels relative to the principal point, at the focal length
-    of `Reconstruction.camera`. The first pose is held, the unit of length only by weak priors on the points; where the
-    camera only turns or stands, all positions are that of the first. Control has no factors.
+    of `Reconstruction.camera`, where a camera without a rolling shutter has them (`Reconstruction.rolled`). The first
+    pose is held, the unit of length only by weak priors on the points; where the camera only turns or stands, all
+    positions are that of the first. Control has no factors.
 
     What was observed weighs what it weighs in the polish, and the values are those of the minimum: Levenberg-Marquardt
-    stays within a tenth of the standard deviations of the poses, within four tenths where weak priors of the polish
-    decide for lack of parallax. Poses that were fitted to images with a rolling shutter (`RollingShutter.recorded`) are
-    no minimum. Once the unit is fixed, the standard deviations are those of `FrameResult.covariance`, or up to a tenth
-    smaller where the depth prior decides: its values are those without its smooth error.
+    stays within a tenth of the standard deviations of the poses. It stays within four tenths where weak priors of the
+    polish decide for lack of parallax, or where poses are fitted to a strong rolling shutter. Once the unit is fixed,
+    the standard deviations are those of `FrameResult.covariance`, or up to a tenth smaller where the depth prior
+    decides: its values are those without its smooth error.
 
     Where the noise is unknown (`Reconstruction.noise`), the observations have a Cauchy kernel and the size of their
     residuals, and there is no prior.
@@ -166,10 +169,11 @@ def _add_projections(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, r:
         r.observation_point[rows],
     )
     observed, predicted, ratio = np.empty((len(rows), 2)), np.empty((len(rows), 2)), np.empty(len(rows))
+    seen = r.observation_xy[rows] if r.rolled is None else (r.observation_xy - r.rolled)[rows]
     for i in np.unique(frame_of):
         mine, camera = frame_of == i, r.camera_of(r.frames[i])
         q = r.frames[i].cam_from_world * r.points[point_of[mine]]
-        observed[mine] = focal * normalized_from_pixels(camera, r.observation_xy[rows[mine]])
+        observed[mine] = focal * normalized_from_pixels(camera, seen[mine])
         predicted[mine] = focal * q[:, :2] / q[:, 2:]
         ratio[mine] = focal / camera.mean_focal_length()
     keys = [X(r.frames[i].index) for i in frame_of], [L(j) for j in r.track_ids[point_of].tolist()]

@@ -123,6 +123,7 @@ def _put_together(
         prior_residual=np.concatenate([base.prior_residual, np.full(len(fresh.frame), np.nan)]),
         point_std=None,
         noise=None,
+        rolled=None,
         notes=list(base.notes),
     )
     result.observation_error = _errors(result)

@@ -208,10 +208,10 @@ def _put_under_control(result: Polished, adjustment: BundleAdjustment, control: 
 def _fit_to_recorded_images(result: Polished, options: PolishOptions) -> None:
     """Cameras without a rolling shutter that show the points most nearly where the recorded images do."""
     weight = cauchy(result.errors[:, None] / result.sigma, options.kernel)[1]
-    moves = result.motion.kind is ShotKind.GENERAL
+    moves, model = result.motion.kind is ShotKind.GENERAL, ErrorModel(result.sigma)
+    rolling = BundleAdjustment(result.state, result.observations, options, model).reprojection_vectors()
     state = replace(seen_at_once(result.state, result.observations, weight, moves=moves), world=-1)
     result.state, result.recorded = state.seen_from(0), True
-    result.errors = BundleAdjustment(
-        result.state, result.observations, options, ErrorModel(result.sigma)
-    ).reprojection_errors()
+    at_once = BundleAdjustment(result.state, result.observations, options, model)
+    result.rolled, result.errors = rolling - at_once.reprojection_vectors(), at_once.reprojection_errors()
     result.sigma = coordinate_sigma(result.errors)

@@ -37,7 +37,8 @@ class Polished:
         left_out: why, of the registered images that have no pose here.
         lens: the estimate of an unknown lens, None where it is known.
         shutter: a rolling shutter, None where the shot shows none; recorded: whether poses are those of cameras without
-            one, fitted to the recorded images, see `Options.shutter`.
+            one, fitted to the recorded images, see `Options.shutter`; rolled: (m, 2) where each observation is beside
+            where such a camera would have it (pixels), None where they are not.
         world_alignment: from this world to that of the control; control: its residuals. None without control.
         control_unused: whether there is control that could not take part.
     """
@@ -60,6 +61,7 @@ class Polished:
     lens: LensEstimate | None = None
     shutter: Shutter | None = None
     recorded: bool = False
+    rolled: Array | None = None
     world_alignment: Similarity | None = None
     control: ControlFit | None = None
     control_unused: bool = False

@@ -76,6 +76,7 @@ def assemble(
         noise=observations.noise,
         lens=None if polished.lens is None else _lens_fit(polished.lens),
         shutter=None if polished.shutter is None else _rolling_shutter(polished.shutter, recorded=polished.recorded),
+        rolled=observations.rolled,
         metric=scale is not None,
         control=polished.control,
         seconds=seconds,
@@ -127,6 +128,7 @@ class _Observations:
     error: Array
     prior_residual: Array
     noise: ObservationNoise
+    rolled: Array | None
 
 
 def _usable_points(polished: Polished) -> Index:
@@ -152,7 +154,8 @@ def _observations_of(polished: Polished, images: Sequence[MappedImage], points: 
     residual, residual_sigma = (relative[keep] for relative in _prior_residuals(polished))
     shift = 0.0 if polished.prior is None else polished.prior.observations.shift_sigma
     noise = ObservationNoise(polished.observation_sigma[keep], polished.track_sigma[points], residual_sigma, shift)
-    return _Observations(positions, row_of[o.point[keep]], xy, polished.errors[keep], residual, noise)
+    rolled = None if polished.rolled is None else polished.rolled[keep]
+    return _Observations(positions, row_of[o.point[keep]], xy, polished.errors[keep], residual, noise, rolled)
 
 
 def _prior_residuals(polished: Polished) -> tuple[Array, Array]:

@@ -168,6 +168,8 @@ class Reconstruction:
         noise: how the observations are weighed; None if unknown.
         lens: how well the lens is known, None if it was given.
         shutter: the rolling shutter, None if none was found.
+        rolled: (m, 2) pixels, how far the shutter displaces each observation beside a camera without one at the poses;
+            None if the poses are not fitted to recorded images (`RollingShutter.recorded`), or if unknown.
         metric: whether the world unit is the metre (from a metric prior, or from control).
         control: how well the control is met, None without control.
         notes: sentences for the user (translation unobservable, focal length guessed, ...).
@@ -192,6 +194,7 @@ class Reconstruction:
     noise: ObservationNoise | None = None
     lens: LensFit | None = None
     shutter: RollingShutter | None = None
+    rolled: NDArray[np.float64] | None = None
     metric: bool = False
     control: ControlFit | None = None
     notes: list[str] = field(default_factory=list)

@@ -8,15 +8,16 @@ import numpy as np
 from gtsam.symbol_shorthand import L, X
 
 from factorsfm import Options, Reconstruction, Stream
+from factorsfm.support.options import ShutterUse
 from factorsfm.synthetic import Motion, render_shot
 from tests.rendered import Maps, rendered, simulated_maps, with_fewer_tracks
 
 
 @cache
-def result(motion: Motion, guided: bool = True) -> Reconstruction:
+def result(motion: Motion, guided: bool = True, shutter: ShutterUse = "global") -> Reconstruction:
     shot = rendered(motion)
     prior = Maps(simulated_maps(motion)) if guided else None
-    stream = Stream(shot.camera, depth=prior, options=replace(with_fewer_tracks(Options()), shutter="global"))
+    stream = Stream(shot.camera, depth=prior, options=replace(with_fewer_tracks(Options()), shutter=shutter))
     for image in shot.images:
         stream.push(image)
     return stream.finish()

@@ -117,6 +117,22 @@ def test_the_result_is_its_minimum(motion: Motion, guided: bool, most: float) ->
         assert shift == pytest.approx(prior.shift, abs=0.3 * prior.shift_std)
 
 
+def test_poses_that_are_fitted_to_a_rolling_shutter_are_its_minimum() -> None:
+    r = result("truck", guided=False, shutter="auto")
+    assert r.shutter is not None
+    assert r.shutter.recorded
+    found = moved_in_deviations(r)
+    assert np.abs(found).max() < 0.01
+    assert 1.0 < np.abs(moved_in_deviations(replace(r, rolled=None))).max() < 10.0
+
+
+def moved_in_deviations(r: Reconstruction) -> np.ndarray:
+    """(frames - 1, 6) by how many standard deviations the optimiser moves the poses, in the same unit."""
+    graph, values = factor_graph(r)
+    found = optimized(graph, values)
+    return moved(values, found, unit_of(found, r))[1:] / standard_deviations(r)[1:]
+
+
 def test_a_longer_result_is_its_minimum_and_as_certain() -> None:
     r = longer_result()
     graph, values = factor_graph(r)

@@ -87,6 +87,23 @@ def test_the_relative_covariance_is_that_of_the_relative_pose() -> None:
     np.testing.assert_array_equal(relative[0], 0.0)
 
 
+def test_relative_poses_are_as_wrong_as_their_covariances_say() -> None:
+    wrong = []
+    for seed in range(8):
+        problem = make_problem("handheld", frames=10, points=200, noise_px=0.3, seed=seed)
+        truth = problem.truth
+        adjustment = BundleAdjustment(truth, problem.observations, PolishOptions(), ErrorModel(0.3))
+        state = adjustment.solve()
+        _, relative = covariances(state, in_scene_unit(adjustment.marginals(), state))
+        unit = state.inverse_distance.mean() / truth.inverse_distance.mean()
+        exact = [pose_from_camera(r, t) for r, t in zip(truth.rotation, truth.translation, strict=True)]
+        found = [pose_from_camera(r, unit * t) for r, t in zip(state.rotation, state.translation, strict=True)]
+        for k in range(1, 10):
+            error = exact[k - 1].between(exact[k]).localCoordinates(found[k - 1].between(found[k]))
+            wrong.append(error @ np.linalg.solve(relative[k], error) / 6)
+    assert 0.7 < np.mean(wrong) < 1.4
+
+
 @pytest.mark.parametrize(
     ("motion", "frames", "single", "pairs"),
     [
