@@ -15,7 +15,9 @@ from factorsfm.frames.frame import Frame
 from factorsfm.frames.live_sources import Source, open_source
 from factorsfm.frames.raw import RawFormat
 from factorsfm.frames.reading import read_frames
+from factorsfm.graph.condensed import condensed_factor
 from factorsfm.graph.explicit_graph import factor_graph
+from factorsfm.graph.pose_factors import pose_factors
 from factorsfm.imagesets.add_images import add_images
 from factorsfm.inertial.fit import ImuFit
 from factorsfm.inertial.mounting import open_imu
@@ -83,11 +85,13 @@ __all__ = [
     "TrackerOptions",
     "UpAxis",
     "add_images",
+    "condensed_factor",
     "factor_graph",
     "find_shots",
     "guess_camera",
     "open_imu",
     "open_source",
+    "pose_factors",
     "read_camera",
     "read_control",
     "read_frames",

@@ -20,6 +20,7 @@ from factorsfm.adjustment.marginals import Marginals, tangent_basis
 from factorsfm.adjustment.noise import block_inflation
 from factorsfm.adjustment.observations import Observations, PriorObservations
 from factorsfm.adjustment.problem import NOTHING, POSES, CameraTerm, ErrorModel, Free, Known
+from factorsfm.adjustment.residuals import cauchy
 from factorsfm.adjustment.semidefinite import conditioned, covariance_of, solution
 from factorsfm.adjustment.state import State
 from factorsfm.adjustment.track_term import TrackTerm
@@ -124,10 +125,22 @@ class BundleAdjustment:
         place = self.state.normalized(self.observations)
         return block_inflation(self.reprojection_vectors(), self.observations.frame, place)
 
-    def prior_residuals(self) -> Array:
-        """(m,) residuals of the prior (unit of its inverse depth)."""
+    def observation_sigmas(self) -> tuple[Array, Array]:
+        """(m,) standard deviations that the observations have at their present weights, and (n,) of the error that
+        each track keeps over a stretch (pixels)."""
+        errors = self.errors.tracks
+        if errors is None:
+            weight = cauchy(self._tracks.residual(self.state)[0], self.options.kernel)[1]
+            return self.sigma / np.sqrt(weight), np.zeros(len(self.state.bearing))
+        return self.sigma / errors.root_weight, self.sigma / errors.sigma * errors.persistent
+
+    def prior_residuals(self) -> tuple[Array, Array]:
+        """(m,) residuals of the prior, and their standard deviations at their present weights (unit of its inverse
+        depth)."""
         assert self.prior is not None
-        return DepthTerm(self.prior, self.options.kernel).residual(self.state) * self.prior.sigma
+        residual = DepthTerm(self.prior, self.options.kernel).residual(self.state)
+        weight = cauchy(residual[:, None], self.options.kernel)[1]
+        return residual * self.prior.sigma, self.prior.sigma / np.sqrt(weight)
 
     def _cost(self, state: State) -> float:
         cost = self._tracks.cost(state)

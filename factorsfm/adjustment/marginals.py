@@ -92,6 +92,28 @@ def in_scene_unit(marginals: Marginals, state: State, control: Array | None = No
     return marginals.relative(motion[:, None], measured)
 
 
+def pose_covariances(camera: Array, derivative: Array, columns: Index, state: State) -> tuple[Array, Array]:
+    """(k, 6, 6) of the poses, and (k, 6, 6) of each pose relative to the one before, that of the first zero.
+
+    A relative pose ``previous_from_this`` is perturbed on the right like `world_from_cam`; it moves by the perturbation
+    of this pose less that of the previous one, which the adjoint map of ``this_from_previous`` carries over.
+
+    Args:
+        camera: (c, c) covariance of the camera side.
+        derivative: (k, 6, d) of the perturbation of each pose by some columns; columns: (k, d) which.
+    """
+    own = derivative @ camera[columns[:, :, None], columns[:, None]] @ derivative.transpose(0, 2, 1)
+    turn = state.rotation[1:] @ state.rotation[:-1].transpose(0, 2, 1)
+    shift = state.translation[1:] - np.einsum("kij,kj->ki", turn, state.translation[:-1])
+    adjoint = np.zeros((len(turn), 6, 6))
+    adjoint[:, :3, :3] = adjoint[:, 3:, 3:] = turn
+    adjoint[:, 3:, :3] = cross_matrices(shift) @ turn
+    both = np.concatenate([derivative[1:], -adjoint @ derivative[:-1]], 2)
+    used = np.concatenate([columns[1:], columns[:-1]], 1)
+    relative = both @ camera[used[:, :, None], used[:, None]] @ both.transpose(0, 2, 1)
+    return np.asarray(own), np.concatenate([np.zeros((1, 6, 6)), relative])
+
+
 def scene_weights(marginals: Marginals, state: State) -> Array:
     """(n,) how much each point counts in the place of the scene: less if it is far away or badly determined."""
     w, variance = state.inverse_distance, marginals.point[:, 2, 2]

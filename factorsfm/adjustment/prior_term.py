@@ -39,7 +39,7 @@ class PriorPart:
     Attributes:
         weight: its measured error model.
         images: (p,) rows of the frames that carry it.
-        observations: its values; residual: (m,) in units of its inverse depth.
+        observations: its values; residual, residual_sigma: (m,) see `BundleAdjustment.prior_residuals`.
         scale_std, shift_std: (p,) of the affines.
     """
 
@@ -47,6 +47,7 @@ class PriorPart:
     images: Index
     observations: PriorObservations
     residual: Array
+    residual_sigma: Array
     scale_std: Array
     shift_std: Array
 
@@ -126,7 +127,7 @@ def joint_problem(
     state = replace(state, scale=first_scale, shift=first_shift, field=np.zeros(len(information)))
     joint = BundleAdjustment(state, observations, options, errors, prior=prior, free=free)
     none = np.zeros(0)
-    return joint, PriorPart(weighed.weight, values.rows, prior, none, none, none)
+    return joint, PriorPart(weighed.weight, values.rows, prior, none, none, none, none)
 
 
 @dataclass(frozen=True, slots=True)

@@ -38,6 +38,7 @@ class TrackErrors:
         root_weight: (m,) square root of the robust weight of each.
         first: (g,) row of the first observation of each stretch of a track; stretch: (m,) to which each belongs.
         shared: (g,) by which the outer product of a stretch's weights is reduced, the persistent part eliminated.
+        persistent: (n,) standard deviation of the persistent part of each track (pixels).
     """
 
     sigma: float
@@ -45,6 +46,7 @@ class TrackErrors:
     first: Index
     stretch: Index
     shared: Array
+    persistent: Array
 
     def sums(self, weighted: Array) -> Array:
         """(..., g) over each stretch of something (..., m) that is weighted already."""
@@ -89,4 +91,4 @@ def measure_track_errors(residual: Array, observations: Observations, kernel: fl
     weight = cauchy(residual / typical, kernel)[1]
     ratio = persistent[track] / sigma**2
     shared = ratio / (1.0 + ratio * np.add.reduceat(weight, first))
-    return TrackErrors(sigma, np.sqrt(weight), first, stretch, shared)
+    return TrackErrors(sigma, np.sqrt(weight), first, stretch, shared, np.sqrt(persistent))

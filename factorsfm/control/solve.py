@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.columns import Columns
-from factorsfm.adjustment.marginals import Marginals, in_scene_unit
+from factorsfm.adjustment.marginals import Marginals, in_scene_unit, pose_covariances
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import Free, Known
 from factorsfm.adjustment.state import State
@@ -44,13 +44,15 @@ class Controlled:
     Attributes:
         adjustment: at its minimum, in the world of the polish.
         world_alignment: from that to the world of the control; None where this has no unit of its own.
-        covariance: (k, 6, 6) of the poses in the control's world, in the polish's unit of length.
+        covariance: (k, 6, 6) of the poses in the control's world, in the polish's unit of length;
+            relative_covariance: of each pose relative to the one before.
         camera_covariance: (c, c) of the camera side relative to the scene's unit.
     """
 
     adjustment: BundleAdjustment
     world_alignment: Similarity | None
     covariance: Array
+    relative_covariance: Array
     marginals: Marginals
     camera_covariance: Array
     fit: ControlFit
@@ -142,13 +144,14 @@ def described(solved: BundleAdjustment, term: AlignedTerm, fit: Callable[[float,
     state, marginals = solved.state, solved.marginals()
     aligned = term.aligned(state)
     relative = in_scene_unit(marginals, state, _by_size(aligned))
-    covariance = _pose_covariance(marginals, aligned)
+    covariance, relative_covariance = _pose_covariances(marginals, aligned)
     log_scale = Columns.of(state).control.start + 6
     spread = aligned.scale * np.sqrt(np.trace(covariance[:, 3:, 3:], axis1=1, axis2=2))
     scale_std = float(np.sqrt(max(float(relative[log_scale, log_scale]), 0.0)))
     return Controlled(
-        solved, aligned.similarity, covariance, marginals, relative, fit(scale_std, float(np.median(spread)))
-    )
+        solved, aligned.similarity, covariance, relative_covariance, marginals, relative,
+        fit(scale_std, float(np.median(spread))),
+    )  # fmt: skip
 
 
 def _residuals(term: ControlTerm, state: State) -> list[ControlResidual]:
@@ -160,23 +163,23 @@ def _residual(item: Item, residual: Array) -> ControlResidual:
     return ControlResidual(item.name, item.unit, sigmas * item.sigma, item.sigma, sigmas, sigmas > _CONTRADICTION)
 
 
-def _pose_covariance(marginals: Marginals, aligned: AlignedState) -> Array:
-    """(k, 6, 6) of the poses in the control's world (GTSAM's convention), in the polish's unit of length.
+def _pose_covariances(marginals: Marginals, aligned: AlignedState) -> tuple[Array, Array]:
+    """As `pose_covariances`, of the poses in the control's world, in the polish's unit of length.
 
     A change of the world alignment turns and moves all cameras: ``R (s x) + T`` by its variables, seen from the camera.
     """
     state, columns = aligned.state, aligned.columns
-    blocks = np.empty((len(state.rotation), 6, 6))
+    derivatives = np.zeros((len(state.rotation), 6, 6 + ALIGNMENT))
+    used = np.empty((len(state.rotation), 6 + ALIGNMENT), np.int64)
     for row, rotation in enumerate(state.rotation):
         _, _, by_place = aligned.known_place(Place(row, camera=True))
         world_from_cam = aligned.rotation @ rotation.T
-        derivative = np.zeros((6, 6 + ALIGNMENT))
+        derivative = derivatives[row]
         derivative[:, :6] = np.eye(6)
         derivative[:3, 6:9] = rotation @ aligned.own_turn
         derivative[3:, 6:] = world_from_cam.T @ by_place[:, 3:] / aligned.scale
-        mine = np.append(columns.pose(row), aligned.first + np.arange(ALIGNMENT))
-        blocks[row] = derivative @ marginals.camera[np.ix_(mine, mine)] @ derivative.T
-    return blocks
+        used[row] = np.append(columns.pose(row), aligned.first + np.arange(ALIGNMENT))
+    return pose_covariances(marginals.camera, derivatives, used, state)
 
 
 def _by_size(aligned: AlignedState) -> Array:

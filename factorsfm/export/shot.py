@@ -224,7 +224,7 @@ def make_shot(reconstruction: Reconstruction, options: ExportOptions, defaults: 
 
 def _in_world(reconstruction: Reconstruction, world: NDArray[np.float64], scale: float) -> Reconstruction:
     old_from_new = pycolmap.Rotation3d(world.T)
-    frames = [replace(frame, covariance=None, prior=None) for frame in reconstruction.frames]
+    frames = [replace(frame, covariance=None, relative_covariance=None, prior=None) for frame in reconstruction.frames]
     for frame in frames:
         pose = frame.cam_from_world
         if pose is not None:

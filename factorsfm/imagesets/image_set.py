@@ -316,7 +316,10 @@ class ImageSet:
         factor = np.array([lenses[photo.camera].mean_focal_length() for photo in self.photos])
         factor /= result.camera.mean_focal_length()
         result.camera = lenses[most]
-        result.observation_error = result.observation_error * factor[result.observation_frame]
+        by_observation = factor[result.observation_frame]
+        result.observation_error = result.observation_error * by_observation
+        if result.noise is not None:
+            result.noise = replace(result.noise, pixel=result.noise.pixel * by_observation)
         for frame, photo, own_factor in zip(result.frames, self.photos, factor.tolist(), strict=True):
             if photo.camera != most:
                 frame.camera = lenses[photo.camera]

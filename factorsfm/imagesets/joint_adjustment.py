@@ -122,6 +122,8 @@ def _put_together(
         observation_xy=np.concatenate([base.observation_xy, fresh.xy]),
         prior_residual=np.concatenate([base.prior_residual, np.full(len(fresh.frame), np.nan)]),
         point_std=None,
+        noise=None,
+        rolled=None,
         notes=list(base.notes),
     )
     result.observation_error = _errors(result)
@@ -162,7 +164,7 @@ def _describe(frames: list[FrameResult], solved: Solved, back: Similarity, new: 
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(state.rotation[row]), state.translation[row])
         rotation, translation = local_pose(pose, back)
         frame.cam_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), translation)
-        frame.covariance, frame.observability = blocks[row], observability[row]
+        frame.covariance, frame.relative_covariance, frame.observability = blocks[row], None, observability[row]
         if position in new:
             frame.inliers, frame.keyframe = int((mine < threshold).sum()), True
             frame.reprojection_error = float(np.median(mine)) if len(mine) else float("nan")

@@ -11,6 +11,7 @@ from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.noise import SMALLEST_SIGMA_PX
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import ErrorModel
+from factorsfm.adjustment.residuals import cauchy
 from factorsfm.lens.lens import Lens, LensEstimate
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.mapping.registration import register_image
@@ -99,7 +100,11 @@ def _registered_between(
 def _insert(
     result: Polished, poses: dict[int, Pose], registered: list[int], group: Index, seen: Observations, options: Options
 ) -> None:
-    """Put the frames between into the result; each is as certain as the nearest solved one."""
+    """Put the frames between into the result.
+
+    Each is as certain as the nearest solved one, and relative to the frame before as the following solved one is
+    relative to its own. Their observations have the kernel's weights.
+    """
     frames, solved = sorted(poses), np.array(result.frames)
     nearest = np.argmin(np.abs(np.array(frames)[:, None] - solved), axis=1)
     result.state = replace(
@@ -109,6 +114,8 @@ def _insert(
         group=group[np.isin(registered, frames)],
     )
     result.covariance = result.covariance[nearest]
+    following = np.clip(np.searchsorted(solved, frames), 1, len(solved) - 1)
+    result.relative_covariance = result.relative_covariance[following]
     result.observability = [result.observability[k] for k in nearest]
     if result.prior is not None:
         p, new_row = result.prior, np.searchsorted(frames, solved)
@@ -121,3 +128,5 @@ def _insert(
     result.errors = BundleAdjustment(
         result.state, result.observations, options.polish, ErrorModel(result.sigma)
     ).reprojection_errors()
+    weight = cauchy(result.errors[:, None] / result.sigma, options.polish.kernel)[1]
+    result.observation_sigma = result.observation_sigma.min() / np.sqrt(weight)

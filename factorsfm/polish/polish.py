@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
-from factorsfm.adjustment.marginals import in_scene_unit
+from factorsfm.adjustment.columns import Columns
+from factorsfm.adjustment.marginals import in_scene_unit, pose_covariances
 from factorsfm.adjustment.noise import coordinate_sigma
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.prior_term import PriorPart, joint_problem
@@ -25,7 +26,7 @@ from factorsfm.lens.rolling_shutter import Recording, seen_at_once
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.polish.connected_frames import connected_frames
 from factorsfm.polish.frames_between import add_frames_between, solved_frames, too_few_tracks
-from factorsfm.polish.observability import camera_observability, pose_blocks
+from factorsfm.polish.observability import camera_observability
 from factorsfm.polish.polished import Polished
 from factorsfm.polish.shot import Shot
 from factorsfm.polish.start import PolishStart, polish_start
@@ -38,6 +39,7 @@ Index = NDArray[np.int64]
 
 logger = logging.getLogger(__name__)
 
+_TOLERANCE = 1e-5  # of the last solution; with ten times as much, poses stay a tenth of a standard deviation away
 _FIRST_ITERATIONS = 2  # over all tracks, until their errors are measured
 
 
@@ -162,11 +164,18 @@ def _solved(
     covariance = in_scene_unit(marginals, adjustment.state)
     result = Polished(
         frames, adjustment.state, start.tracks, start.observations, adjustment.reprojection_errors(), start.sigma,
-        start.motion, pose_blocks(covariance, len(frames)), camera_observability(adjustment, marginals, covariance),
-        marginals.inverse_distance_std(covariance), left_out, prior, start.lens, start.shutter,
+        *adjustment.observation_sigmas(), start.motion, *_pose_covariances(covariance, adjustment.state),
+        camera_observability(adjustment, marginals, covariance), marginals.inverse_distance_std(covariance),
+        left_out, prior, start.lens, start.shutter,
     )  # fmt: skip
     result.describe_prior(adjustment, covariance)
     return adjustment, result
+
+
+def _pose_covariances(covariance: Array, state: State) -> tuple[Array, Array]:
+    """As `pose_covariances`, from the covariance of the camera side."""
+    rows = np.arange(len(state.rotation))
+    return pose_covariances(covariance, np.tile(np.eye(6), (len(rows), 1, 1)), Columns.of(state).pose(rows), state)
 
 
 def _problem(
@@ -180,7 +189,10 @@ def _problem(
         scale = errors.sigma
     # Correlated errors, from frame to frame and among neighbours, weigh less; the kernel keeps its width in pixels. The
     # persistent part of a track is counted twice by that: correlations among neighbours last longer than a stretch.
-    model, options = ErrorModel(scale * wide, errors), replace(options, kernel=options.kernel / wide)
+    model, options = (
+        ErrorModel(scale * wide, errors),
+        replace(options, kernel=options.kernel / wide, tolerance=_TOLERANCE),
+    )
     if start.prior is None:
         return BundleAdjustment(state, start.observations, options, model, free=Free(translation=moves)), None
     return joint_problem(
@@ -218,7 +230,8 @@ def _respect_factors(result: Polished, adjustment: BundleAdjustment, factors: Sh
 
 def _take_over(result: Polished, found: Controlled) -> None:
     result.state, result.errors = found.adjustment.state, found.adjustment.reprojection_errors()
-    result.covariance, result.world_alignment, result.control = found.covariance, found.world_alignment, found.fit
+    result.covariance, result.relative_covariance = found.covariance, found.relative_covariance
+    result.world_alignment, result.control = found.world_alignment, found.fit
     result.point_std = found.marginals.inverse_distance_std(found.camera_covariance)
     result.describe_prior(found.adjustment, found.camera_covariance)
 
@@ -226,10 +239,10 @@ def _take_over(result: Polished, found: Controlled) -> None:
 def _fit_to_recorded_images(result: Polished, options: PolishOptions) -> None:
     """Cameras without a rolling shutter that show the points most nearly where the recorded images do."""
     weight = cauchy(result.errors[:, None] / result.sigma, options.kernel)[1]
-    moves = result.motion.kind is ShotKind.GENERAL
+    moves, model = result.motion.kind is ShotKind.GENERAL, ErrorModel(result.sigma)
+    rolling = BundleAdjustment(result.state, result.observations, options, model).reprojection_vectors()
     state = replace(seen_at_once(result.state, result.observations, weight, moves=moves), world=-1)
     result.state, result.recorded = state.seen_from(0), True
-    result.errors = BundleAdjustment(
-        result.state, result.observations, options, ErrorModel(result.sigma)
-    ).reprojection_errors()
+    at_once = BundleAdjustment(result.state, result.observations, options, model)
+    result.rolled, result.errors = rolling - at_once.reprojection_vectors(), at_once.reprojection_errors()
     result.sigma = coordinate_sigma(result.errors)

@@ -29,13 +29,16 @@ class Polished:
     Attributes:
         frames: (k,) positions of the images in `state`; tracks: (n,) track of each point.
         errors: (m,) reprojection errors of `observations` (pixels); sigma: their standard deviation.
-        covariance: (k, 6, 6) of the poses, GTSAM's convention, `in_scene_unit`.
+        observation_sigma, track_sigma: see `BundleAdjustment.observation_sigmas`.
+        covariance: (k, 6, 6) of the poses, GTSAM's convention, `in_scene_unit`; relative_covariance: of each
+            relative to the one before.
         observability: of the pose of each camera.
         point_std: (n,) standard deviations of the inverse distances, in the same unit.
         left_out: why, of the registered images that have no pose here.
         lens: the estimate of an unknown lens, None where it is known.
         shutter: a rolling shutter, None where the shot shows none; recorded: whether poses are those of cameras without
-            one, fitted to the recorded images, see `Options.shutter`.
+            one, fitted to the recorded images, see `Options.shutter`; rolled: (m, 2) where each observation is beside
+            where such a camera would have it (pixels), None where they are not.
         world_alignment: from this world to that of the control; control: its residuals. None without control.
         unused: "Control" or "Factors added", where there are some that could not take part.
     """
@@ -46,8 +49,11 @@ class Polished:
     observations: Observations
     errors: Array
     sigma: float
+    observation_sigma: Array
+    track_sigma: Array
     motion: Motion
     covariance: Array
+    relative_covariance: Array
     observability: list[CameraObservability]
     point_std: Array
     left_out: dict[int, str]
@@ -55,6 +61,7 @@ class Polished:
     lens: LensEstimate | None = None
     shutter: Shutter | None = None
     recorded: bool = False
+    rolled: Array | None = None
     world_alignment: Similarity | None = None
     control: ControlFit | None = None
     unused: str = ""
@@ -68,5 +75,5 @@ class Polished:
         if self.prior is None:
             return
         std = np.sqrt(camera_covariance.diagonal())
-        self.prior.residual = adjustment.prior_residuals()
+        self.prior.residual, self.prior.residual_sigma = adjustment.prior_residuals()
         self.prior.scale_std, self.prior.shift_std = std[adjustment.columns.scales], std[adjustment.columns.shifts]

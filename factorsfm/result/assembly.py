@@ -20,7 +20,7 @@ from factorsfm.polish.polished import Polished
 from factorsfm.priors.depth_map import DepthKind
 from factorsfm.result.frame_results import SourceFrame, frame_results
 from factorsfm.result.notes import result_notes
-from factorsfm.result.reconstruction import LensFit, Reconstruction, RollingShutter
+from factorsfm.result.reconstruction import LensFit, ObservationNoise, Reconstruction, RollingShutter
 from factorsfm.support.parallax import parallax
 from factorsfm.support.rotations import camera_centers
 from factorsfm.support.similarity import Similarity
@@ -73,8 +73,10 @@ def assemble(
         kind=polished.motion.kind,
         parallax=parallax(camera_centers(state.rotation, state.translation), state.inverse_distance),
         point_std=polished.point_std[kept] / state.inverse_distance[kept] if general else None,
+        noise=observations.noise,
         lens=None if polished.lens is None else _lens_fit(polished.lens),
         shutter=None if polished.shutter is None else _rolling_shutter(polished.shutter, recorded=polished.recorded),
+        rolled=observations.rolled,
         metric=scale is not None,
         control=polished.control,
         seconds=seconds,
@@ -125,6 +127,8 @@ class _Observations:
     xy: Array
     error: Array
     prior_residual: Array
+    noise: ObservationNoise
+    rolled: Array | None
 
 
 def _usable_points(polished: Polished) -> Index:
@@ -147,23 +151,30 @@ def _observations_of(polished: Polished, images: Sequence[MappedImage], points: 
     for position in np.unique(positions):
         mine, tracks = positions == position, images[position].tracks
         xy[mine] = tracks.pixels[np.searchsorted(tracks.ids, ids[mine])]
-    return _Observations(positions, row_of[o.point[keep]], xy, polished.errors[keep], _prior_residuals(polished)[keep])
+    residual, residual_sigma = (relative[keep] for relative in _prior_residuals(polished))
+    shift = 0.0 if polished.prior is None else polished.prior.observations.shift_sigma
+    noise = ObservationNoise(polished.observation_sigma[keep], polished.track_sigma[points], residual_sigma, shift)
+    rolled = None if polished.rolled is None else polished.rolled[keep]
+    return _Observations(positions, row_of[o.point[keep]], xy, polished.errors[keep], residual, noise, rolled)
 
 
-def _prior_residuals(polished: Polished) -> Array:
-    """(m,) residual of the depth prior relative to the predicted inverse depth; NaN where there is no prior."""
+def _prior_residuals(polished: Polished) -> tuple[Array, Array]:
+    """(m,) residual of the depth prior relative to the predicted inverse depth, and its standard deviation; NaN where
+    there is no prior."""
     o, prior = polished.observations, polished.prior
-    residuals = np.full(len(o.point), np.nan)
+    residuals, sigmas = np.full((2, len(o.point)), np.nan)
     if prior is None:
-        return residuals
+        return residuals, sigmas
     p = prior.observations
     # Observations are sorted by point and frame, those with a prior are not.
     order = np.lexsort((p.frame, p.point))
     stride = len(polished.frames) + 1
     at = np.searchsorted(o.point * stride + o.frame, (p.point * stride + p.frame)[order])
-    predicted = prior.residual + p.inverse_depth - polished.state.shift[p.image]
-    residuals[at] = (prior.residual / np.maximum(np.abs(predicted), 1e-6))[order]
-    return residuals
+    state = polished.state
+    depth = state.camera_points(p.frame, p.point)[:, 2] / state.inverse_distance[p.point]
+    size = state.scale[p.image] / np.maximum(depth, _LEAST_DEPTH)
+    residuals[at], sigmas[at] = (prior.residual / size)[order], (prior.residual_sigma / size)[order]
+    return residuals, sigmas
 
 
 # --- lens and shutter ---------------------------------------------------------------------------------------------

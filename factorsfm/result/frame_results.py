@@ -74,9 +74,10 @@ def _add_solution(result: FrameResult, polished: Polished, row: int, camera: pyc
     state, lens = polished.state, polished.lens
     rotation = pycolmap.Rotation3d(state.rotation[row])
     result.cam_from_world = pycolmap.Rigid3d(rotation, state.translation[row] * unit)
-    result.covariance = polished.covariance[row].copy()
-    result.covariance[3:] *= unit
-    result.covariance[:, 3:] *= unit
+    size = np.repeat([1.0, unit], 3)
+    result.covariance = polished.covariance[row] * np.outer(size, size)
+    if row > 0:
+        result.relative_covariance = polished.relative_covariance[row] * np.outer(size, size)
     result.observability = polished.observability[row]
     if len(state.log_focal) > 1:
         result.camera = with_focal(camera, float(state.focal[row]))

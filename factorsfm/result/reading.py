@@ -69,8 +69,9 @@ def read_result(directory: str | Path) -> Reconstruction:
     """Read what `Reconstruction.write` has written.
 
     Poses, points, colours and the lens come back exactly, observations to a millionth of a pixel. What the files do
-    not hold is missing: covariances, the tracks' identities (here: the points' rows), the prior's residuals (NaN),
-    observations in frames that are not registered, and points that fewer than two registered frames see.
+    not hold is missing: covariances, the observations' noise, the tracks' identities (here: the points' rows), the
+    prior's residuals (NaN), observations in frames that are not registered, and points that fewer than two registered
+    frames see.
 
     Raises:
         InputError: the folder holds no result, an incomplete or a damaged one, or that of a shot that could not be

@@ -76,6 +76,24 @@ class RollingShutter:
     recorded: bool
 
 
+@dataclass(frozen=True, slots=True)
+class ObservationNoise:
+    """Standard deviations with which the polish weighs what was observed, large for an outlier.
+
+    Attributes:
+        pixel: (m,) of each coordinate of an observation, pixels.
+        track: (n,) of the error that the track of a point keeps for 16 registered frames, counted from the first of
+            them, pixels; 0 where it keeps none.
+        prior: (m,) of a value of the depth prior, relative like `Reconstruction.prior_residual`.
+        shift: of the shifts of the prior's maps around 0, in units of the median value of a map; 0 without a prior.
+    """
+
+    pixel: NDArray[np.float64]
+    track: NDArray[np.float64]
+    prior: NDArray[np.float64]
+    shift: float
+
+
 @dataclass(slots=True)
 class FrameResult:
     """One frame of the source.
@@ -94,6 +112,9 @@ class FrameResult:
         covariance: (6, 6) of (rotation vector, translation), for a perturbation of `world_from_cam` on the right. It is
             relative to the first registered camera, with the scene's scale fixed by the mean inverse distance of the
             points; with control it is absolute, in the control's world and unit. None if unknown.
+        relative_covariance: (6, 6) of the pose relative to that of the registered frame before, for a perturbation of
+            ``previous_from_this`` on the right, with the scale fixed in the same way. None for the first registered
+            frame, and if unknown.
         observability: how well tracks and prior determine the pose, None if unknown.
         thumbnail: a small JPEG of the image, or None.
         camera: the lens of this frame if the frames do not share one, else None; see `Reconstruction.camera_of`.
@@ -112,6 +133,7 @@ class FrameResult:
     reprojection_error: float = float("nan")
     prior: PriorFit | None = None
     covariance: NDArray[np.float64] | None = None
+    relative_covariance: NDArray[np.float64] | None = None
     observability: CameraObservability | None = None
     thumbnail: bytes | None = None
     camera: pycolmap.Camera | None = None
@@ -144,8 +166,11 @@ class Reconstruction:
         parallax: largest camera displacement over the median point depth (paper, section 4).
         point_std: (n,) relative standard deviation of the inverse distance of each point from the first registered
             camera, with the scale fixed as in `FrameResult.covariance`; None if unknown.
+        noise: how the observations are weighed; None if unknown.
         lens: how well the lens is known, None if it was given.
         shutter: the rolling shutter, None if none was found.
+        rolled: (m, 2) pixels, how far the shutter displaces each observation beside a camera without one at the poses;
+            None if the poses are not fitted to recorded images (`RollingShutter.recorded`), or if unknown.
         metric: whether the world unit is the metre (from a metric prior, or from control).
         control: how well the control is met, or factors that were added; None without either.
         imu: what an IMU has given, None without one that took part.
@@ -168,8 +193,10 @@ class Reconstruction:
     kind: ShotKind
     parallax: float
     point_std: NDArray[np.float64] | None = None
+    noise: ObservationNoise | None = None
     lens: LensFit | None = None
     shutter: RollingShutter | None = None
+    rolled: NDArray[np.float64] | None = None
     metric: bool = False
     control: ControlFit | None = None
     imu: ImuFit | None = None

@@ -324,6 +324,11 @@ def test_frames_between_have_the_observability_of_the_nearest():
     result = polished(make_problem("truck", frames=12, points=200, noise_px=0.1), max_frames=6)
     assert len(result.observability) == len(result.frames) == 12
     assert len({c.pixel_slide for c in result.observability}) == 6
+    assert len(result.covariance) == len(result.relative_covariance) == 12
+    assert all(np.linalg.eigvalsh(c)[0] > 0 for c in result.relative_covariance)
+    assert len(np.unique(result.relative_covariance, axis=0)) == 5
+    assert len(result.observation_sigma) == len(result.errors)
+    assert 0.05 < result.observation_sigma.min() < np.median(result.observation_sigma) < 0.2
 
 
 @pytest.mark.parametrize(("motion", "kind"), [("rotation", ShotKind.ROTATION), ("static", ShotKind.STATIC)])

@@ -1,0 +1,57 @@
+"""Results of rendered shots, and covariances of the poses of their graphs."""
+
+from dataclasses import replace
+from functools import cache
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import L, X
+
+from factorsfm import Options, Reconstruction, Stream
+from factorsfm.support.options import ShutterUse
+from factorsfm.synthetic import Motion, render_shot
+from tests.rendered import Maps, rendered, simulated_maps, with_fewer_tracks
+
+
+@cache
+def result(motion: Motion, guided: bool = True, shutter: ShutterUse = "global") -> Reconstruction:
+    shot = rendered(motion)
+    prior = Maps(simulated_maps(motion)) if guided else None
+    stream = Stream(shot.camera, depth=prior, options=replace(with_fewer_tracks(Options()), shutter=shutter))
+    for image in shot.images:
+        stream.push(image)
+    return stream.finish()
+
+
+@cache
+def longer_result() -> Reconstruction:
+    """Longer than the time for which the errors of tracks persist."""
+    shot = render_shot("dolly", 40, 320, 180)
+    stream = Stream(shot.camera, options=replace(with_fewer_tracks(Options(), 120), shutter="global"))
+    for image in shot.images:
+        stream.push(image)
+    return stream.finish()
+
+
+def pose_covariance(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, r: Reconstruction) -> np.ndarray:
+    """(6 k, 6 k) of the registered poses, the unit of length fixed as in `FrameResult.covariance`."""
+    poses, points = [X(frame.index) for frame in r.registered], [L(j) for j in r.track_ids]
+    ordering = gtsam.Ordering()
+    for key in [*poses, *points, *sorted(set(values.keys()) - {*poses, *points})]:
+        ordering.push_back(key)
+    information = graph.linearize(values).hessian(ordering)[0]
+    size = np.sqrt(np.diag(information))
+    covariance = np.linalg.inv(information / np.outer(size, size)) / np.outer(size, size)
+    # Errors of the poses, when the solution is scaled to the mean inverse distance of the result.
+    distance = np.linalg.norm(r.points, axis=1)
+    by_point = -r.points / distance[:, None] ** 3 / np.sum(1.0 / distance)
+    wrong = np.zeros(len(covariance))
+    wrong[6 * len(poses) : 6 * len(poses) + by_point.size] = by_point.ravel()
+    relative = np.eye(len(covariance))[: 6 * len(poses)] + np.outer(size_motion(values, poses), wrong)
+    return relative @ covariance @ relative.T
+
+
+def size_motion(values: gtsam.Values, poses: list[int]) -> np.ndarray:
+    """(6 k,) by how much the poses move with the logarithm of the scene's size."""
+    places = [values.atPose3(key).rotation().unrotate(values.atPose3(key).translation()) for key in poses]
+    return np.concatenate([np.append(np.zeros(3), place) for place in places])
