@@ -32,6 +32,7 @@ class ImuNoise:
         accelerometer_walk: density of the random walk of its bias, m/s^3/sqrt(Hz).
         gyroscope_bias: standard deviation of its bias at the start, rad/s.
         accelerometer_bias: standard deviation of its bias at the start, m/s^2.
+        accelerometer_scale: relative error of the accelerometer's scale, by which all lengths may be off.
 
     Raises:
         InputError: a value is not positive.
@@ -43,6 +44,7 @@ class ImuNoise:
     accelerometer_walk: float = 2e-4
     gyroscope_bias: float = 0.02
     accelerometer_bias: float = 0.2
+    accelerometer_scale: float = 0.005
 
     def __post_init__(self) -> None:
         for one in dataclasses.fields(self):

@@ -40,8 +40,8 @@ def add_imu(result: Reconstruction, imu: ImuSource, factors: FactorsOnPoses | No
     bridged = _bridge_gaps(result, imu.recording, state)
     result.imu = ImuFit(
         up=(-state.gravity / np.linalg.norm(state.gravity)).tolist(),
-        up_std=float(np.degrees(up_std)),
-        scale_std=result.control.scale_std,
+        up_std=float(np.degrees(np.hypot(up_std, timing.rotation_sigma))),
+        scale_std=float(np.hypot(result.control.scale_std, imu.recording.noise.accelerometer_scale)),
         cam_from_imu=timing.cam_from_imu.tolist(),
         rotation_std=float(np.degrees(timing.rotation_sigma)),
         time_offset=timing.time_offset,
