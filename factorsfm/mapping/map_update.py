@@ -75,7 +75,7 @@ def update_map(copy: MapCopy, graph: KeyframeGraph) -> MapUpdate:
     focal, window = None, result.window
     if copy.refine_focal and len(copy.keyframes) >= _LENS_KEYFRAMES:
         focal, window = _better_focal(window)
-    update = _judged(copy, images, window, result, focal)
+    update = judged(copy, images, window, result, focal)
     if len(others):
         update = solve_alone(copy, images, update, others, guidance)
     return replace(update, removed=np.union1d(update.removed, removed), burn_ins=burn_ins) if len(burn_ins) else update
@@ -150,7 +150,7 @@ def _better_focal(window: Window) -> tuple[float | None, Window]:
     )
 
 
-def _judged(
+def judged(
     copy: MapCopy, images: list[MappedImage], window: Window, result: UpdateResult, focal: float | None
 ) -> MapUpdate:
     """The solution as the map takes it over, and what in it does not fit."""
