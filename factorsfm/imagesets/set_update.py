@@ -44,7 +44,7 @@ def update_set(copy: MapCopy, graph: KeyframeGraph, shared: Index, held: Mask) -
     if not result.committed:
         return MapUpdate(newest.position, None, False, result.reason), np.inf
     update = judged(copy, images, result.window, result, None)
-    if len(others):
+    if len(others) and not constant.any():  # else the map as a whole stays; what is left is for the adjustment of all
         update = solve_alone(copy, images, update, others, DepthGuidance(copy.options, copy.points))
     return update, _worst_error(result.window)
 
