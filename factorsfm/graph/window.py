@@ -41,8 +41,8 @@ class Window:
     """Keyframes and landmarks with their present values, and the measurements that join them.
 
     Attributes:
-        keyframes: (k,) index of the frame of each in its source, the newest last; constant: (k,) which poses do not
-            change.
+        keyframes: (k,) index of the frame of each in its source, in the order in which they joined the map;
+            constant: (k,) which poses do not change, the same or others than in the window before.
         rotation (k, 3, 3), translation (k, 3): `cam_from_world`.
         ids: (n,) tracks, ascending; points: (n, 3) landmarks in the world.
         frame, point: (m,) rows of the keyframe and of the landmark of each observation.

@@ -1,7 +1,8 @@
-"""The incremental mapper for unordered images: start, next best image, triangulate, adjust.
+"""The incremental mapper for unordered images: start, next best image, triangulate, update the graph.
 
-The steps are those of `mapper`; what differs is the order, which is chosen, and the adjustment: images are far apart
-here, so that all of them are adjusted together, on their best tracks, whenever the map has grown.
+The steps and the graph are those of `mapping.mapper`; what differs is the order, which is chosen, and with it the
+window of the graph. All images are adjusted together, on their best tracks, while the map does not fit yet or its focal
+length is open, and then whenever it has grown by a lot.
 """
 
 from __future__ import annotations
@@ -17,10 +18,13 @@ from numpy.typing import NDArray
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.gather import gather
 from factorsfm.adjustment.problem import ErrorModel, Free
+from factorsfm.graph.keyframe_graph import KeyframeGraph
 from factorsfm.imagesets.covisibility import common_tracks, longest_tracks, pyramid_score, track_lengths
+from factorsfm.imagesets.set_update import update_set
 from factorsfm.imagesets.start import median_angle, possible_starts
 from factorsfm.mapping.depth_fallback import DepthGuidance
 from factorsfm.mapping.incremental import IncrementalMapper, add_points, triangulate_tracks
+from factorsfm.mapping.map_copy import MapCopy
 from factorsfm.mapping.mapped_images import MappedImage, state_of
 from factorsfm.mapping.point_map import PointMap
 from factorsfm.mapping.registration import Registration
@@ -42,7 +46,10 @@ _LEAST_ANGLE_DEG = 1.5  # between the rays of a new point; less where those of t
 _LEAST_ANGLE_SHARE = 0.3  # of the median angle of the map
 _WORKING_TRACKS = (150, 1000, 60_000)  # per image while the map grows: at least, at most, and in the whole set
 _LEAST_FITTING, _MOST_CONTRADICTED = 0.5, 0.25  # shares of an image's observations, and of the images
-_GROWTH = 0.1  # of the number of images after which the map is adjusted
+_GROWTH = 0.1  # of the number of images after which all are adjusted, until the map fits
+_SETTLED_GROWTH = 1.0  # the same for a map that fits
+_SETTLED_SIGMAS = 2.0  # largest median error in a map that fits, in standard deviations of an observation
+_SETTLED_FOCAL = 0.01  # last relative change of a focal length that is known well enough
 _GOOD_PX = 4.0  # reprojection error of a good observation
 _FOCAL_IMAGES, _FOCAL_ANGLE_DEG = 4, 3.0  # from which a guessed focal length is refined with the map
 
@@ -50,7 +57,8 @@ _FOCAL_IMAGES, _FOCAL_ANGLE_DEG = 4, 3.0  # from which a guessed focal length is
 def for_image_sets(options: Options) -> Options:
     """Two views make a track, wrong matches are single observations, and keypoints are less exact than tracks.
 
-    Where views are far apart the prior adds nothing to a triangulation; the paper's presets use it all the same.
+    Where views are far apart the prior adds nothing to triangulation and graph; the paper's presets triangulate with it
+    all the same.
     """
     depth = options.mapper.triangulation_depth
     return replace(
@@ -58,6 +66,7 @@ def for_image_sets(options: Options) -> Options:
         mapper=replace(
             options.mapper,
             pixel_sigma=0.5,
+            graph_depth=False,
             triangulation_depth="none" if depth == "inverse" else depth,
         ),
         polish=replace(
@@ -116,6 +125,9 @@ class SetMapper(IncrementalMapper):
         self._common = common_tracks(tracks)
         self._order: list[MappedImage] = []  # of registration; the first one is the world
         self._adjusted = 0
+        self._graph = KeyframeGraph()
+        self._fits = False  # whether all images that the last adjustment or update was about agree with the map
+        self._focal_change = np.inf  # relative, when it was refined last
         self._tried: dict[int, int] = {}  # by position: mapped tracks with which an image was tried last
         self._scores: dict[int, tuple[int, int]] = {}  # by position: mapped tracks, and their score
         self._released: set[int] = set()  # positions of images that were taken out of the map again, once each
@@ -216,18 +228,34 @@ class SetMapper(IncrementalMapper):
             while (image := self._next()) is not None:
                 if self._register(image):
                     self._extend(working, image)
-                    if len(self._order) >= self._adjusted * (1.0 + _GROWTH):
-                        self._adjust()
-                        self._extend(working)
+                    self._take_in(working)
             if len(self._order) == self._adjusted:
                 return
             self._adjust()  # images that it releases come next
             self._extend(working)
 
+    def _take_in(self, working: Index | None) -> None:
+        """Solve for the newest image and those around it, or for all where that is not enough."""
+        growth = len(self._order) / self._adjusted - 1.0
+        if self._is_settled() and growth < _SETTLED_GROWTH:
+            self._update()
+        if growth >= (_SETTLED_GROWTH if self._is_settled() else _GROWTH):
+            self._adjust()
+            self._extend(working)
+
+    def _is_settled(self) -> bool:
+        """Whether the map fits as well as it can with few images of it solved for at a time."""
+        return self._fits and (not self._focal_is_open() or self._focal_change < _SETTLED_FOCAL)
+
+    def _focal_is_open(self) -> bool:
+        """Whether the focal length is a guess that the map can refine."""
+        return self._refine_focal and len(self._order) >= _FOCAL_IMAGES and self._angle > _FOCAL_ANGLE_DEG
+
     def _begin(self, start: Start) -> None:
         for image in self._order:
             image.rotation = image.translation = None
         self.points, self._order, self._adjusted = PointMap(), [], 0
+        self._fits, self._focal_change = False, np.inf
         self._released.clear()
         self._angle = median_angle(start)
         self._accept_start(start)
@@ -298,6 +326,17 @@ class SetMapper(IncrementalMapper):
                 guidance.fit(image)
         return guidance
 
+    def _update(self) -> None:
+        """Update the graph with the newest image; what does not fit then is left to the adjustment of all images."""
+        position = np.array([image.tracks.position for image in self._order])
+        copy = MapCopy(self._order, self.points, self.options, self.focal)
+        shared, held = self._common[position[-1], position], np.isin(position, list(self._held))
+        update, error = update_set(copy, self._graph, shared, held)
+        self._fits = error < _SETTLED_SIGMAS * self.options.pixel_sigma
+        if self._fits:
+            self._accept_update(update)
+        logger.debug("image %d: graph %s, median error of the worst image %.2f px", position[-1], update.reason, error)
+
     def _adjust(self) -> None:
         """Bundle adjustment of all registered images; points without two good observations are forgotten."""
         ids, points = self.points.all()
@@ -309,16 +348,19 @@ class SetMapper(IncrementalMapper):
         state = state_of(self._order, points, self.focal)
         errors = BundleAdjustment(state, observations, self._adjustment, ErrorModel(1.0)).reprojection_errors()
         sigma = max(float(np.median(errors)), self.options.pixel_sigma)
-        free_focal = self._refine_focal and len(self._order) >= _FOCAL_IMAGES and self._angle > _FOCAL_ANGLE_DEG
+        free_focal = self._focal_is_open()
         held = np.array([image.tracks.position in self._held for image in self._order]) if self._held else None
         adjustment = BundleAdjustment(
             state, observations, self._adjustment, ErrorModel(sigma), free=Free(focal=free_focal, held=held)
         )
         state = adjustment.solve()
         focal = float(np.exp(state.log_focal[0]))
+        self._focal_change = abs(focal / self.focal - 1.0) if free_focal else np.inf
         if free_focal and 0.3 < focal / self.first_focal < 3.0:
             self._set_focal(focal)
         errors = adjustment.reprojection_errors()
+        self._fits = float(np.median(errors)) < _SETTLED_SIGMAS * self.options.pixel_sigma
+        self._graph = KeyframeGraph()  # from the map as it is now
         logger.debug(
             "adjusted %d images, %d points, %d observations to %.2f px in %d iterations",
             len(self._order), len(ids), len(errors), np.median(errors), adjustment.iterations,

@@ -1,4 +1,7 @@
-"""Which keyframes and landmarks an update of the graph is about, and what was measured of them."""
+"""Which keyframes and landmarks an update of the graph is about, and what was measured of them.
+
+The images of a set are keyframes, too, in the order in which they joined the map instead of that of time.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,7 @@ Index = NDArray[np.int64]
 
 _FREE_KEYFRAMES = 16  # that an update solves for; those before are constant
 _HELD_KEYFRAMES = 8  # constant ones that take part, with what they saw
-_LEAST_SHARED = 30  # landmarks by which a constant keyframe takes part
+LEAST_SHARED = 30  # landmarks by which a constant keyframe takes part
 _MOST_LANDMARKS = 900  # in the graph
 _LARGEST_SIGMA_PX = 3.0
 _DEPTH_SIGMA = 0.6  # relative error of a network at a landmark, its smooth part included, as it usually is
@@ -47,28 +50,49 @@ def taking_part(keyframes: list[MappedImage], named: set[int]) -> tuple[list[Map
 def choose_window(keyframes: list[MappedImage], named: set[int]) -> tuple[list[MappedImage], NDArray[np.bool_]]:
     """The keyframes that take part, in order of time, and which of them are constant; `named` as in `taking_part`."""
     before, free = taking_part(keyframes, named)
-    window = [image for image in before if shared_tracks(image.tracks, free[-1].tracks) >= _LEAST_SHARED] + free
-    constant = np.arange(len(window)) < len(window) - len(free)
-    if before:
+    window = before + free
+    shared = np.array([shared_tracks(image.tracks, free[-1].tracks) for image in before] + [0] * len(free))
+    rows, constant = window_rows(shared, np.arange(len(window)) >= len(before), _HELD_KEYFRAMES)
+    return [window[k] for k in rows], constant
+
+
+def window_rows(shared: Index, free: NDArray[np.bool_], most_held: int) -> tuple[Index, NDArray[np.bool_]]:
+    """Rows (ascending) of the keyframes that take part, and which of them are constant.
+
+    Args:
+        shared: (k,) tracks that each keyframe shares with the newest one, the last.
+        free: (k,) which of them are solved for; of the others those that share most are constant.
+        most_held: how many at most.
+    """
+    others = np.flatnonzero(~free)
+    held = others[np.argsort(-shared[others], kind="stable")[:most_held]]
+    held = held[shared[held] >= LEAST_SHARED]
+    rows = np.sort(np.concatenate([held, np.flatnonzero(free)]))
+    constant = ~free[rows]
+    if len(others) and constant.sum() < 2:
         constant[:2] = True  # two constant cameras keep place and size
-    return window, constant
+    return rows, constant
 
 
-def choose_landmarks(images: list[MappedImage], ids: Index, named: set[int]) -> tuple[Index, Index]:
+def choose_landmarks(
+    images: list[MappedImage], ids: Index, named: set[int], most: int = _MOST_LANDMARKS
+) -> tuple[Index, Index]:
     """Landmarks that become variables of the graph, and points that are solved alone, with the new poses.
 
     In the graph are those that factors of the caller name, those that the newest keyframe sees, and of the others those
     that most keyframes see.
+
+    Args:
+        named: tracks; most: in the graph.
     """
-    room = _MOST_LANDMARKS
-    if len(ids) <= room:
+    if len(ids) <= most:
         return ids, ids[:0]
     seen = np.sum([np.isin(ids, image.tracks.ids) for image in images], axis=0)
-    most = len(images) + 1
-    first = most * np.isin(ids, images[-1].tracks.ids) + 2 * most * np.isin(ids, sorted(named))
+    above = len(images) + 1
+    first = above * np.isin(ids, images[-1].tracks.ids) + 2 * above * np.isin(ids, sorted(named))
     rank = np.argsort(-(seen + first), kind="stable")
     inside = np.zeros(len(ids), bool)
-    inside[rank[:room]] = True
+    inside[rank[:most]] = True
     return ids[inside], ids[~inside]
 
 
@@ -83,7 +107,7 @@ def measured_window(
     """The window of the graph: keyframes and landmarks as the map has them, and their measurements.
 
     Args:
-        images: keyframes in order of time; constant: (k,) which of their poses do not change; ids: of the landmarks.
+        images: keyframes, the newest last; constant: (k,) which of their poses do not change; ids: of the landmarks.
     """
     tracks = [image.tracks for image in images]
     observations = gather(tracks, ids, focal)

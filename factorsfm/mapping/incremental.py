@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from factorsfm.adjustment.gather import gather
 from factorsfm.mapping.depth_fallback import DepthGuidance
+from factorsfm.mapping.map_copy import MapUpdate
 from factorsfm.mapping.map_registration import NotOnMap, register_on_map
 from factorsfm.mapping.mapped_images import MappedImage, refocus, state_of
 from factorsfm.mapping.point_map import PointMap
@@ -78,6 +79,17 @@ class IncrementalMapper:
             pose = Registration(rotation, translation, inliers, 0.0, self.options.inlier_px, np.zeros((6, 6)))
             self._accept(image, pose)
         return images
+
+    def _accept_update(self, update: MapUpdate) -> None:
+        """The map as the graph sees it now: points, and poses and affines of the images that moved."""
+        self.points.set(update.ids, update.points)
+        self.points.remove(update.removed)
+        for position, pose in update.poses.items():
+            self.images[position].rotation, self.images[position].translation = pose
+        for position, covariance in update.covariances.items():
+            self.images[position].covariance = covariance
+        for position, affine in update.affines.items():
+            self.images[position].affine = affine
 
     def explain(self, position: int, status: FrameStatus, message: str) -> None:
         """Say why an image is not registered, where that is known better than by its tracks; no word if it is."""

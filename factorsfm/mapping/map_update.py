@@ -101,7 +101,7 @@ def _extended(copy: MapCopy, graph: KeyframeGraph) -> MapUpdate:
         result = _solved(copy, graph, images, constant, ids, _YOUNG_ITERATIONS)
     if not result.committed:
         return MapUpdate(position, depth, False, result.reason, mirrored=result.mirrored)
-    update = _judged(copy, images, result)
+    update = judged(copy, images, result)
     if len(others):
         update = solve_alone(copy, images, update, others, guidance)
     return replace(update, removed=np.union1d(update.removed, removed), burn_ins=burn_ins) if len(burn_ins) else update
@@ -182,7 +182,7 @@ def _lifted_anew(copy: MapCopy, window: list[MappedImage], ids: Index) -> Index:
     return first.ids[good]
 
 
-def _judged(copy: MapCopy, images: list[MappedImage], result: UpdateResult) -> MapUpdate:
+def judged(copy: MapCopy, images: list[MappedImage], result: UpdateResult) -> MapUpdate:
     """The solution as the map takes it over, and what in it does not fit."""
     unit = _unit(images, result.window)
     window = result.window.scaled(unit)

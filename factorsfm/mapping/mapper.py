@@ -401,14 +401,7 @@ class Mapper(IncrementalMapper):
             self._rescale(update.unit)
         before = image.pose
         self.new_points += int((~self.points.contains(update.ids)).sum())
-        self.points.set(update.ids, update.points)
-        self.points.remove(update.removed)
-        for position, pose in update.poses.items():
-            self.images[position].rotation, self.images[position].translation = pose
-        for position, covariance in update.covariances.items():
-            self.images[position].covariance = covariance
-        for position, affine in update.affines.items():
-            self.images[position].affine = affine
+        self._accept_update(update)
         self.burn_ins = np.union1d(self.burn_ins, update.burn_ins)
         carry(image, before, self.images[update.position + 1 :])
         if update.focal is not None:

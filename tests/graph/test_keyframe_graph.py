@@ -386,6 +386,19 @@ def test_keyframes_that_leave_the_window_leave_the_graph():
         assert {key for key in keys if gtsam.symbolChr(key) != ord("l")} <= shot.variables()
 
 
+def test_a_constant_keyframe_may_be_solved_for_again():
+    """In sets of images the window is no longer one of time: keyframes come back, in any order."""
+    shot = Shot("handheld").run(4)
+    n = len(shot.points)
+    for frames in ([0, 1, 2, 3, 4], [3, 4, 0, 1, 2, 5], [0, 2, 1, 3, 4, 5]):
+        assert shot.update(frames, constant=2).committed
+        assert {X(k) for k in frames[2:]} == {key for key in shot.variables() if gtsam.symbolChr(key) == ord("x")}
+        assert shot.count()["projection"] == n * len(frames[2:])
+        assert shot.count()["constant"] == n * 2
+    assert shot.update(range(FRAMES)).committed
+    assert (errors(shot) < [2e-6, 2e-6, 3e-5]).all()
+
+
 def test_landmarks_that_leave_the_window_leave_the_graph():
     shot = Shot("handheld").run(4)
     n, few = len(shot.points), np.arange(10, 30)

@@ -8,7 +8,7 @@ import pytest
 from factorsfm.graph.keyframe_graph import KeyframeGraph
 from factorsfm.mapping import graph_window
 from factorsfm.mapping.depth_fallback import DepthGuidance
-from factorsfm.mapping.graph_window import choose_landmarks, measured_window
+from factorsfm.mapping.graph_window import choose_landmarks, measured_window, window_rows
 from factorsfm.mapping.landmarks import solve_alone
 from factorsfm.mapping.map_copy import MapCopy, MapUpdate
 from factorsfm.mapping.map_update import update_map
@@ -52,6 +52,25 @@ def test_of_too_many_in_the_newest_keyframe_those_with_most_views_are_in_the_gra
     inside, outside = choose_landmarks([image_of(0, ids[100:]), image_of(1, ids)], ids, set())
     np.testing.assert_array_equal(inside, ids[100:])
     np.testing.assert_array_equal(outside, ids[:100])
+
+
+def test_those_that_share_most_with_the_newest_are_constant_beside_what_is_free():
+    shared, free = np.array([40, 29, 90, 60, 50, 0]), np.array([False, False, True, False, False, True])
+    rows, constant = window_rows(shared, free, 2)
+    np.testing.assert_array_equal(rows, [2, 3, 4, 5])
+    np.testing.assert_array_equal(constant, [False, True, True, False])
+    rows, constant = window_rows(shared, free, 8)
+    np.testing.assert_array_equal(rows, [0, 2, 3, 4, 5])  # too little is shared with the second
+    np.testing.assert_array_equal(constant, [True, False, True, True, False])
+
+
+def test_two_cameras_are_constant_unless_all_are_free():
+    rows, constant = window_rows(np.array([40, 20, 90, 60]), np.array([False, False, True, True]), 8)
+    np.testing.assert_array_equal(rows, [0, 2, 3])
+    np.testing.assert_array_equal(constant, [True, True, False])
+    rows, constant = window_rows(np.array([40, 50, 0]), np.ones(3, bool), 8)
+    np.testing.assert_array_equal(rows, [0, 1, 2])
+    assert not constant.any()
 
 
 def handheld(noise_px=0.0):

@@ -1,4 +1,4 @@
-"""An IMU beside a stream: metric scale, up, and the poses of frames that show nothing; and recordings that do not fit."""
+"""An IMU beside a stream: metric scale, up, poses of frames that show nothing; and recordings that do not fit."""
 
 import json
 from dataclasses import replace
