@@ -75,7 +75,7 @@ def window_rows(shared: Index, free: NDArray[np.bool_], most_held: int) -> tuple
 
 
 def choose_landmarks(
-    images: list[MappedImage], ids: Index, named: set[int], most: int = _MOST_LANDMARKS
+    images: list[MappedImage], ids: Index, named: set[int], most: int | None = None
 ) -> tuple[Index, Index]:
     """Landmarks that become variables of the graph, and points that are solved alone, with the new poses.
 
@@ -83,8 +83,9 @@ def choose_landmarks(
     that most keyframes see.
 
     Args:
-        named: tracks; most: in the graph.
+        named: tracks; most: in the graph, by default as many as in that of a video.
     """
+    most = most or _MOST_LANDMARKS
     if len(ids) <= most:
         return ids, ids[:0]
     seen = np.sum([np.isin(ids, image.tracks.ids) for image in images], axis=0)

@@ -223,7 +223,8 @@ def assert_robust_gradient(factor, values, cost):
         for key in keys
     ]
     numerical = np.concatenate(numerical)
-    np.testing.assert_allclose(-matrix.T @ right, numerical, rtol=1e-5, atol=1e-6 * np.abs(numerical).max())
+    # The narrowest kernel bends within a step.
+    np.testing.assert_allclose(-matrix.T @ right, numerical, rtol=1e-5, atol=1e-5 * np.abs(numerical).max())
 
 
 @examples
