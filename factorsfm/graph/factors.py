@@ -11,6 +11,7 @@ moves ``q`` by ``q x omega - w v``.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any
 
 import gtsam
@@ -208,6 +209,7 @@ def pixel_noise(sigma: float) -> gtsam.noiseModel.Robust:
     return _robust(gtsam.noiseModel.Isotropic.Sigma(2, sigma))
 
 
+@lru_cache(1024)
 def depth_noise(sigma: float) -> gtsam.noiseModel.Robust:
     """Of `native_depth_factor`: `sigma` in the unit of the prior, in a Cauchy kernel; the second row means nothing."""
     return _robust(gtsam.noiseModel.Diagonal.Sigmas(np.array([sigma, 1e6])))
