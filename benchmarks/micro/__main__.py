@@ -13,6 +13,7 @@ from benchmarks.micro.batch_solvers import batch_solvers
 from benchmarks.micro.depth_factors import depth_factors
 from benchmarks.micro.front_end import front_end
 from benchmarks.micro.incremental_graph import incremental_updates
+from benchmarks.micro.small_solves import small_solves
 from benchmarks.run import HERE, machine
 
 
@@ -24,6 +25,7 @@ def main() -> None:
     sections: dict[str, Callable[[], str]] = {
         "Depth factors": depth_factors,
         "Incremental graph": incremental_updates,
+        "Small solves": small_solves,
         "Batch solvers": batch_solvers,
         "Front end": partial(front_end, arguments.models),
     }
