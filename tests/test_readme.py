@@ -8,6 +8,7 @@ import shlex
 import shutil
 import sys
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +17,12 @@ import numpy as np
 import pytest
 from onnx import helper
 
-from factorsfm import PRESETS, DepthKind, FrameStatus, ShotKind, read_camera, read_control, reconstruct
+from factorsfm import PRESETS, DepthKind, FrameStatus, ShotKind, open_imu, read_camera, read_control, reconstruct
 from factorsfm.cli import main as cli
 from factorsfm.export import FORMATS
 from factorsfm.priors import models
-from factorsfm.synthetic import render_shot, write_shot
+from factorsfm.synthetic import RenderedShot, render_shot, write_shot
+from tests.instruments import CHECKS, WALK_FRAMES, write_measurements, write_walk
 from tests.networks import save_network
 from tests.pages import ALL_PAGES, CONTRIBUTING, DOCS, PAGES, README, ROOT, rows, table, text_of
 
@@ -67,11 +69,16 @@ def each(language: str) -> pytest.MarkDecorator:
 # --- examples ---------------------------------------------------------------------------------------------------
 
 
+@cache
+def shot_of_the_examples() -> RenderedShot:
+    return render_shot(frames=FRAMES, width=256, height=144)
+
+
 @pytest.fixture(scope="module")
 def material(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with all files that the examples name; its networks take what is bright for near."""
     folder = tmp_path_factory.mktemp("readme")
-    shot = render_shot(frames=FRAMES, width=256, height=144)
+    shot = shot_of_the_examples()
     write_shot(shot, folder)
     for name in ("images", "masks", "networks", "stills"):
         (folder / name).mkdir()
@@ -92,6 +99,8 @@ def material(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "frames.bgr").write_bytes(np.stack(shot.images).tobytes())
     camera, depth = read_camera(folder / "camera.json"), folder / "depth"
     reconstruct(folder / "shot.mp4", camera=camera, depth=depth, depth_kind="inverse").write(folder / "result")
+    write_measurements(shot, folder)
+    write_walk(folder)
     return folder
 
 
@@ -122,8 +131,9 @@ def test_command(block: Block, place: Path, monkeypatch: pytest.MonkeyPatch) -> 
         if words[1] in ("reconstruct", "stream"):
             assert {path.name for path in output.iterdir()} == FILES
             summary = json.loads((output / "summary.json").read_text())
-            assert summary["registered"] == summary["frames"] == FRAMES
-            assert ("--control" in words) == (summary["control"] is not None)
+            assert summary["registered"] == summary["frames"] == (WALK_FRAMES if "--imu" in words else FRAMES)
+            assert ("--imu" in words) == (summary["imu"] is not None)
+            assert bool({"--control", "--imu"} & set(words)) == (summary["control"] is not None)
             assert not any(item["contradicts"] for item in (summary["control"] or {"residuals": []})["residuals"])
         elif words[1] == "extend":
             assert {path.name for path in output.iterdir()} == FILES
@@ -145,14 +155,21 @@ def test_python(block: Block, place: Path, capsys: pytest.CaptureFixture[str]) -
     names: dict[str, Any] = {"__name__": "__main__"}
     exec(code, names)
     if "reconstruction" in names:
-        assert len(names["reconstruction"].registered) == FRAMES
+        assert len(names["reconstruction"].registered) == (WALK_FRAMES if "walk.mp4" in block.text else FRAMES)
+    for file, check in CHECKS.items():
+        if file in block.text:
+            check(names, shot_of_the_examples())
     if "print(" in block.text:
         assert capsys.readouterr().out.strip()
 
 
 @each("json")
-def test_file(block: Block, tmp_path: Path) -> None:
+def test_file(block: Block, tmp_path: Path, place: Path) -> None:
     (tmp_path / "file.json").write_text(block.text)
+    if '"imu.csv"' in block.text:
+        (tmp_path / "imu.csv").write_text((place / "imu.csv").read_text())
+        assert open_imu(tmp_path / "file.json").noise.accelerometer == 0.002
+        return
     if "poses" in block.text:
         assert read_control(tmp_path / "file.json").frames == ["0", "9", 0, 9]
         return

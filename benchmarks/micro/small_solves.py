@@ -53,7 +53,7 @@ def small_solves() -> str:
                 )
     return (
         "One pose: from a neighbour's, on exact points that stay; the difference is to the true centre, in thousandths "
-        "of the median distance. `register_image` finds the inliers, their noise and the covariance, too. Points alone: "
+        "of the median distance. `register_image` finds inliers, noise and covariance, too. Points alone: "
         "30 known poses, four steps or convergence; the error is the median reprojection error in pixels."
         f"\n\n{table(['problem', 'points', 'solver', 'ms', 'difference or error'], rows)}"
     )

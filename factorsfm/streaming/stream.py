@@ -228,6 +228,13 @@ class Stream(Closing):
         tracks = self._mapper.images[-1].tracks
         return tracks.pixels, self._mapper.points.contains(tracks.ids)
 
+    @property
+    def track_ids(self) -> NDArray[np.int64]:
+        """(n,) of the `tracks` of the newest frame: the j of ``L(j)`` where the map holds them."""
+        if self._mapper is None or not self._mapper.images:
+            return np.zeros(0, np.int64)
+        return self._mapper.images[-1].tracks.ids
+
     def save(self, path: str | Path) -> None:
         """Write everything that is known so far as one file, whole or not at all; the stream can go on.
 
