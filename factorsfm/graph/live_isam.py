@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -13,6 +12,7 @@ from gtsam.symbol_shorthand import A, K, L, T, X
 from numpy.typing import NDArray
 
 from factorsfm.graph.added_factors import HELD, AddedFactors, held_prior, part_of
+from factorsfm.graph.changes import Changes
 from factorsfm.graph.factors import (
     affine_of_native,
     affine_prior,
@@ -100,7 +100,7 @@ class LiveIsam:
         """
         if not self._focal:
             self._focal, self._sigma, self._unit = window.focal, window.sigma, window.unit
-        changes = _Changes()
+        changes = Changes()
         self._leave(window, changes, added, constants)
         self._enter(window, changes)
         self._hold(window, changes, constants)
@@ -147,13 +147,13 @@ class LiveIsam:
 
     def _set_lens_prior(self, focal: float, sigma: float) -> None:
         """Another prior of the focal length, and a step with it."""
-        key, changes = K(0), _Changes()
+        key, changes = K(0), Changes()
         changes.removed.append(self._priors[key])
         changes.add([lens_prior(key, focal, sigma)], partial(self._note_prior, key))
         result = self._isam.update(changes.graph, changes.values, changes.removed, self._eliminated_last(changes))
         changes.settle(np.array(result.getNewFactorsIndices(), np.int64))
 
-    def _eliminated_last(self, changes: _Changes) -> gtsam.KeyGroupMap:
+    def _eliminated_last(self, changes: Changes) -> gtsam.KeyGroupMap:
         """Poses and affines, after the landmarks.
 
         Left alone, iSAM2 eliminates all variables of new factors last, landmarks among them, which fills the tree.
@@ -164,7 +164,7 @@ class LiveIsam:
                 groups.insert2(key, 1)
         return groups
 
-    def _leave(self, window: Window, changes: _Changes, added: AddedFactors, constants: gtsam.Values) -> None:
+    def _leave(self, window: Window, changes: Changes, added: AddedFactors, constants: gtsam.Values) -> None:
         """Landmarks, keyframes and factors of the caller that are in the graph no more, with their factors."""
         free = window.keyframes[~window.constant]
         seen = window.keyframes if window.unknown_lens else free
@@ -192,7 +192,7 @@ class LiveIsam:
         for number in [number for number in self._added if number not in added.numbers]:
             changes.removed.append(self._added.pop(number))
 
-    def _enter(self, window: Window, changes: _Changes) -> None:
+    def _enter(self, window: Window, changes: Changes) -> None:
         """New keyframes and landmarks, each with a weak prior: few observations leave a lot open."""
         world = not window.constant.any()
         for row, keyframe in enumerate(window.keyframes.tolist()):
@@ -208,7 +208,7 @@ class LiveIsam:
             lens = lens_of(self._focal)
             self._add_variable(changes, key, lens, lens_prior(key, self._focal, HELD))
 
-    def _hold(self, window: Window, changes: _Changes, constants: gtsam.Values) -> None:
+    def _hold(self, window: Window, changes: Changes, constants: gtsam.Values) -> None:
         """What does not change, but is named by factors: the caller's, or those on an unknown lens."""
         held = gtsam.Values(constants)
         if window.unknown_lens:
@@ -225,7 +225,7 @@ class LiveIsam:
                 changes.values.insert(part_of(held, [key]))
                 changes.add([prior], partial(self._note_prior, key))
 
-    def _add(self, changes: _Changes, added: AddedFactors) -> None:
+    def _add(self, changes: Changes, added: AddedFactors) -> None:
         """New factors of the caller, and the variables of their own."""
         if not added.numbers and not self._own:
             return
@@ -241,7 +241,7 @@ class LiveIsam:
         changes.add((graph.at(row) for row in rows), told)
 
     def _add_variable(
-        self, changes: _Changes, key: int, value: gtsam.Pose3 | gtsam.Cal3_S2 | Array, prior: gtsam.NonlinearFactor
+        self, changes: Changes, key: int, value: gtsam.Pose3 | gtsam.Cal3_S2 | Array, prior: gtsam.NonlinearFactor
     ) -> None:
         changes.values.insert(key, value)
         changes.add([prior], partial(self._note_prior, key))
@@ -249,7 +249,7 @@ class LiveIsam:
     def _note_prior(self, key: int, slots: Index) -> None:
         self._priors[key] = int(slots[0])
 
-    def _hold_size(self, window: Window, changes: _Changes) -> None:
+    def _hold_size(self, window: Window, changes: Changes) -> None:
         """Hold the unit of length by the distance of two keyframes, until constant ones hold it."""
         if window.unit_held or self._size is not None or window.constant.any() or len(window.keyframes) <= YOUNG:
             return
@@ -263,7 +263,7 @@ class LiveIsam:
 
         changes.add([gtsam.RangeFactorPose3(first, key, length, noise)], told)
 
-    def _observe(self, window: Window, changes: _Changes) -> None:
+    def _observe(self, window: Window, changes: Changes) -> None:
         """Projection factors of new observations; those of constant keyframes are on the landmarks alone."""
         lens, noise = lens_of(window.focal), pixel_noise(self._sigma)
         keyframe, track, constant = (
@@ -295,7 +295,7 @@ class LiveIsam:
                 (factor(*measurement) for measurement in measured), partial(slots.add, keyframe[rows], track[rows])
             )
 
-    def _measure_depths(self, window: Window, changes: _Changes) -> None:
+    def _measure_depths(self, window: Window, changes: Changes) -> None:
         """Depth-consistency factors: of every landmark at least one, of every keyframe a number well spread."""
         d = window.depths
         if d is None:
@@ -390,25 +390,3 @@ class LiveIsam:
         """(6, 6) of each pose that is solved for, by keyframe."""
         solved = window.keyframes[window.solved].tolist()
         return {keyframe: np.asarray(self._isam.marginalCovariance(X(keyframe))) for keyframe in solved}
-
-
-class _Changes:
-    """What an update adds to iSAM2 and removes from it, and who wants to know the slots of what is added."""
-
-    def __init__(self) -> None:
-        self.graph, self.values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        self.removed: list[int] = []
-        self._added: list[tuple[int, Callable[[Index], None]]] = []  # end among the new factors, and who is told
-
-    def add(self, factors: Iterable[gtsam.NonlinearFactor], told: Callable[[Index], None]) -> None:
-        """Add factors; `told` is called with their slots after the update."""
-        for factor in factors:
-            self.graph.add(factor)
-        self._added.append((self.graph.size(), told))
-
-    def settle(self, slots: Index) -> None:
-        """After the update: the slots of the new factors, in the order in which they were added."""
-        begin = 0
-        for end, told in self._added:
-            told(slots[begin:end])
-            begin = end

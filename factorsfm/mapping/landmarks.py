@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 _GROSS = 4.0  # times the threshold of an inlier: a young map is wrong, too, and long tracks are precious
+_REACH = 60  # images to both sides of a lost one from which its tracks are triangulated
 _FARTHEST = 1e-6  # smallest inverse distance of a point
 _ALONE_ITERATIONS = 4
 _SOLVER = replace(PolishOptions(), tolerance=1e-3)
@@ -60,6 +61,24 @@ def add_tracks(
     ids = np.intersect1d(ids, seen_by([image.tracks for image in images], 2))
     ids = ids[~points.contains(ids)]
     return _add_points(points, images, near, ids, DepthGuidance(options, points), focal) if len(ids) else 0
+
+
+def map_tracks(
+    image: MappedImage, images: Sequence[MappedImage], points: PointMap, options: MapperOptions, focal: float
+) -> bool:
+    """Points for the tracks that an image without a pose shares with registered ones; whether there are any.
+
+    Args:
+        images: of the shot, in order of time.
+    """
+    position = image.tracks.position
+    around = images[max(0, position - _REACH) : position + _REACH + 1]
+    registered = [other for other in around if other.registered]
+    if not registered:
+        return False
+    near = min(registered, key=lambda other: abs(other.tracks.position - position))
+    shared = np.intersect1d(near.tracks.ids, image.tracks.ids, assume_unique=True)
+    return add_tracks(points, registered, near, shared, options, focal) > 0
 
 
 def _add_points(

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from factorsfm.graph.added_factors import NOTHING_ADDED, AddedFactors
 from factorsfm.mapping.graph_window import taking_part
-from factorsfm.mapping.mapped_images import MappedImage, scaled
+from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.mapping.point_map import PointMap
 from factorsfm.priors.image_depth import ImageDepth
 from factorsfm.support.options import MapperOptions
@@ -95,7 +95,9 @@ class MapCopy:
 
     def scaled(self, unit: float, added: AddedFactors, *, unit_held: bool) -> MapCopy:
         """An independent copy with all lengths `unit` times as long, and all of the caller's factors as taken."""
-        keyframes = [scaled(image, unit) for image in self.keyframes]
+        keyframes = [replace(image) for image in self.keyframes]
+        for image in keyframes:
+            image.scale(unit)
         return replace(
             self, keyframes=keyframes, points=self.points.scaled(unit), added=added, offered=(),
             unit=self.unit * unit, unit_held=unit_held,

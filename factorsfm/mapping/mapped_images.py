@@ -14,6 +14,7 @@ from factorsfm.support.status import FrameStatus
 from factorsfm.tracks.image_tracks import ImageTracks
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
 
 
 @dataclass(slots=True)
@@ -54,6 +55,31 @@ class MappedImage:
         for field in fields(self):
             setattr(self, field.name, getattr(blank, field.name))
 
+    def scale(self, unit: float) -> None:
+        """Go on in a world where all lengths are `unit` times as long; nothing is changed in place."""
+        if self.translation is not None:
+            self.translation = unit * self.translation
+        if self.affine is not None:
+            self.affine = unit * self.affine[0], self.affine[1]
+        if self.covariance is not None:
+            units = np.repeat([1.0, unit], 3)
+            self.covariance = self.covariance * np.outer(units, units)
+
+    def take_up_tracks(self, ids: Index, pixels: Array) -> None:
+        """Observe further tracks.
+
+        Args:
+            ids: (n,) tracks; pixels: (n, 2) where they are.
+        """
+        joined = self.tracks.joined(ids, pixels)
+        self.tracks = joined.of(np.argsort(joined.ids))
+
+    def forget_tracks(self, ids: Index) -> None:
+        """Leave some tracks out."""
+        keep = ~np.isin(self.tracks.ids, ids)
+        if not keep.all():
+            self.tracks = self.tracks.of(keep)
+
 
 def state_of(images: Sequence[MappedImage], points: Array, focal: float) -> State:
     """Poses of registered images, and Euclidean points (n, 3), as variables of a bundle adjustment."""
@@ -67,17 +93,13 @@ def state_of(images: Sequence[MappedImage], points: Array, focal: float) -> Stat
     )
 
 
-def scaled(image: MappedImage, unit: float) -> MappedImage:
-    """An image, registered or not, in a world where all lengths are `unit` times as long."""
-    image = replace(image)
-    if image.translation is not None:
-        image.translation = unit * image.translation
-    if image.affine is not None:
-        image.affine = unit * image.affine[0], image.affine[1]
-    if image.covariance is not None:
-        units = np.repeat([1.0, unit], 3)
-        image.covariance = image.covariance * np.outer(units, units)
-    return image
+def nearest_registered(images: Sequence[MappedImage], position: int) -> MappedImage:
+    """The registered image nearest to a position in a shot."""
+    for offset in range(1, len(images)):
+        for other in (position - offset, position + offset):
+            if 0 <= other < len(images) and images[other].registered:
+                return images[other]
+    raise ValueError("no image is registered")
 
 
 def refocus(images: Sequence[MappedImage], ratio: float) -> None:

@@ -19,13 +19,13 @@ from factorsfm.mapping.additions import Additions
 from factorsfm.mapping.graph_updates import submit_update
 from factorsfm.mapping.incremental import IncrementalMapper
 from factorsfm.mapping.keyframes import carry, is_keyframe
-from factorsfm.mapping.landmarks import add_tracks
+from factorsfm.mapping.landmarks import map_tracks
 from factorsfm.mapping.live_covariance import live_covariance
 from factorsfm.mapping.map_contents import MapContents
 from factorsfm.mapping.map_copy import MapCopy, MapUpdate
 from factorsfm.mapping.map_registration import register_by_corners
 from factorsfm.mapping.map_update import YOUNG_KEYFRAMES
-from factorsfm.mapping.mapped_images import MappedImage, scaled
+from factorsfm.mapping.mapped_images import MappedImage, nearest_registered
 from factorsfm.mapping.point_map import PointMap
 from factorsfm.mapping.prior_trust import PriorTrust
 from factorsfm.mapping.registration import Registration
@@ -47,7 +47,6 @@ _STATE = (
 )  # fmt: skip
 _RUNNING_OUT = 0.5  # share of an image's tracks with a point, below which the map is extended at once
 _SETTLED, _SETTLED_DELAY = 5, 2  # keyframes of a map that changes little; frames that it waits longer for the graph
-_REACH = 60  # images to both sides of a lost one from which its tracks are triangulated
 
 
 class Mapper(IncrementalMapper):
@@ -62,7 +61,7 @@ class Mapper(IncrementalMapper):
 
     def __init__(self, graph: GraphProcess, focal: float, width: int, options: Options, *, has_prior: bool) -> None:
         super().__init__([], focal, options)
-        self.width = width
+        self.width, self.started = width, False
         self.keyframes: list[int] = []
         self.burn_ins = np.zeros(0, np.int64)  # tracks that the last image showed to be laid over the image
         self.new_points = 0  # that came with the last image
@@ -73,14 +72,12 @@ class Mapper(IncrementalMapper):
         self.starts_anew = False  # whether the map was given up with the last image
         self._graph = graph
         self._update: Future[MapUpdate] | None = None
-        self._due = 0
-        self._advanced = -1  # number of images for which `advance` was called last
+        self._due, self._advanced = 0, -1  # number of images for which `advance` was called last
         self._starter = Starter(self.options, has_prior=has_prior)
         self._reads_every_depth = has_prior and (
             self._starter.kind == "pair" or self.options.registration_depth != "none"
         )
         self._prior = PriorTrust(has_prior and options.uses_depth)
-        self.started = False
 
     # --- snapshots ----------------------------------------------------------------------------------------------
 
@@ -169,7 +166,7 @@ class Mapper(IncrementalMapper):
             self._try_start(read_depth)
             return
         self._register(image)
-        if not image.registered and self._map_tracks(image):
+        if not image.registered and map_tracks(image, self.images, self.points, self.options, self.focal):
             self._register(image)
         if image.registered and self._update is None and self._is_keyframe(image):
             self._add_keyframe(image, read_depth)
@@ -230,23 +227,12 @@ class Mapper(IncrementalMapper):
                 if image.registered or image.status not in NOT_JOINED:
                     continue
                 known = image.status, image.message
-                self._map_tracks(image)
+                map_tracks(image, self.images, self.points, self.options, self.focal)
                 self._register(image)
                 if image.registered:
                     found = True
                 else:
                     image.status, image.message = known
-
-    def _map_tracks(self, image: MappedImage) -> bool:
-        """Points for the tracks that an image without a pose shares with registered ones; whether there are any."""
-        position = image.tracks.position
-        around = self.images[max(0, position - _REACH) : position + _REACH + 1]
-        registered = [other for other in around if other.registered]
-        if not registered:
-            return False
-        near = min(registered, key=lambda other: abs(other.tracks.position - position))
-        shared = np.intersect1d(near.tracks.ids, image.tracks.ids, assume_unique=True)
-        return add_tracks(self.points, registered, near, shared, self.options, self.focal) > 0
 
     # --- start --------------------------------------------------------------------------------------------------
 
@@ -303,7 +289,7 @@ class Mapper(IncrementalMapper):
     # --- registration -------------------------------------------------------------------------------------------
 
     def _register(self, image: MappedImage) -> None:
-        near = image if image.registered else self._nearest_registered(image.tracks.position)
+        near = image if image.registered else nearest_registered(self.images, image.tracks.position)
         self._register_near(image, near, in_order=True)
 
     def relocalize(self, image: MappedImage, ids: Index, xy: Array) -> bool:
@@ -312,7 +298,7 @@ class Mapper(IncrementalMapper):
         Args:
             ids: (n,) tracks that look like corners of the image; xy: (n, 2) these corners, normalised.
         """
-        near = self._nearest_registered(image.tracks.position)
+        near = nearest_registered(self.images, image.tracks.position)
         result, agree = register_by_corners(ids, xy, self.points, near, self.focal, self.options)
         if result is None:
             image.message += f"; not found again: {agree}" if agree else ""
@@ -321,13 +307,6 @@ class Mapper(IncrementalMapper):
         image.inliers = int(result.inliers.sum())
         image.message = f"found again: {agree}"
         return True
-
-    def _nearest_registered(self, position: int) -> MappedImage:
-        for offset in range(1, len(self.images)):
-            for other in (position - offset, position + offset):
-                if 0 <= other < len(self.images) and self.images[other].registered:
-                    return self.images[other]
-        raise ValueError("no image is registered")
 
     def _accept(self, image: MappedImage, found: Registration) -> None:
         super()._accept(image, found)
@@ -338,21 +317,10 @@ class Mapper(IncrementalMapper):
             moved = np.stack([np.zeros(3), image.pose[0].T @ image.pose[1]])
             self.parallax = max(self.parallax, parallax(moved, inverse))
 
-    def take_up_tracks(self, image: MappedImage, ids: Index, pixels: Array) -> None:
-        """Let an image observe further tracks.
-
-        Args:
-            ids: (n,) tracks; pixels: (n, 2) where they are.
-        """
-        joined = image.tracks.joined(ids, pixels)
-        image.tracks = joined.of(np.argsort(joined.ids))
-
     def forget_tracks(self, ids: Index) -> None:
         """Leave some tracks out of the images before the newest, which the graph may be working on."""
         for image in self.images[:-1]:
-            keep = ~np.isin(image.tracks.ids, ids)
-            if not keep.all():
-                image.tracks = image.tracks.of(keep)
+            image.forget_tracks(ids)
 
     # --- keyframes and landmarks --------------------------------------------------------------------------------
 
@@ -412,9 +380,7 @@ class Mapper(IncrementalMapper):
         self.unit *= unit
         self.points = self.points.scaled(unit)
         for image in self.images:
-            rescaled = scaled(image, unit)
-            image.translation, image.affine = rescaled.translation, rescaled.affine
-            image.covariance = rescaled.covariance
+            image.scale(unit)
 
     @property
     def without_prior(self) -> str:

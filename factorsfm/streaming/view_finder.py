@@ -52,7 +52,7 @@ class ViewFinder:
         ids, rows = self.relocalizer.find(grey, image.tracks.pixels)
         if not mapper.relocalize(image, ids, image.tracks.xy[rows]):
             return
-        mapper.take_up_tracks(image, *self._tracker.revive(grey, *self._in_view(mapper, image)))
+        image.take_up_tracks(*self._tracker.revive(grey, *self._in_view(mapper, image)))
 
     def _in_view(self, mapper: Mapper, image: MappedImage) -> tuple[Index, Array]:
         """Ended tracks with a point in front of an image, and where it is seen (pixels)."""
