@@ -173,7 +173,7 @@ class Mapper(IncrementalMapper):
             if hurry:
                 self._take_over()
 
-    def finish(self, last_factors: Callable[[], None] = lambda: None) -> None:
+    def finish(self, last_factors: Callable[[Mapper], None] = lambda mapper: None) -> None:
         """No more images: start with what there is, if nothing better came; all images on the map as it is at last.
 
         Args:
@@ -182,7 +182,7 @@ class Mapper(IncrementalMapper):
         self._take_over()
         if not self.started:
             self._begin(self._starter.last_resort(self._waiting(), self.focal))
-        last_factors()
+        last_factors(self)
         if self.additions.offered:  # no update will take them: the polish does
             self._rescale(unit_of_length(self.additions.everything(), self.contents())[0])
         self.refresh()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -74,6 +74,20 @@ class FrameUpdate:
     focal_changed: bool = False
     starts_anew: bool = False
     note: str = ""
+
+
+class FrameIndices:
+    """Indices that name the variables of frames: their own, or the next free one where another frame has that."""
+
+    def __init__(self, taken: Iterable[int] = ()) -> None:
+        self._taken = set(taken)
+
+    def take(self, index: int) -> int:
+        """The index for the next frame, by its own."""
+        if index in self._taken or index < 0:
+            index = max(self._taken, default=-1) + 1
+        self._taken.add(index)
+        return index
 
 
 def frame_update(

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +48,7 @@ class ImuSource:
         self._last: int | None = None  # position of the newest keyframe with a factor
         self._attempt = -np.inf  # time of the last one to begin
         self._seen = 0  # keyframes of the map so far
+        self._times: list[float] = []  # of the frames, seconds
 
     @property
     def recording(self) -> ImuRecording:
@@ -57,17 +60,52 @@ class ImuSource:
         """Whether its factors are in the graph, or wait for the next update."""
         return self._last is not None
 
-    def wants_keyframe(self, mapper: Mapper, times: Sequence[float]) -> bool:
-        """Whether the newest frame shall be a keyframe, since the last one is long ago."""
-        last = [image.tracks.position for image in mapper.images if image.keyframe][-1:]
-        return bool(last) and times[-1] - times[last[0]] >= _LONGEST_INTERVAL
+    def state(self) -> dict[str, Any]:
+        """Everything but the recording that `restore` needs."""
+        return {
+            "timing": None if self.timing is None else asdict(self.timing),
+            "reason": self.reason,
+            "last": self._last,
+            "attempt": self._attempt,
+            "seen": self._seen,
+            "times": self._times,
+        }
 
-    def follow(self, mapper: Mapper, times: Sequence[float], *, finished: bool = False) -> None:
-        """After a frame: begin, or go on with the keyframes that the map has taken over since.
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go on where `state` was taken."""
+        self.timing = None if state["timing"] is None else ImuTiming(**state["timing"])
+        self.reason, self._last = state["reason"], state["last"]
+        self._attempt, self._seen, self._times = state["attempt"], state["seen"], list(state["times"])
+
+    def wants_keyframe(self, mapper: Mapper, index: int, time: float | None) -> bool:
+        """Whether the next frame shall be a keyframe, since the last one is long ago.
 
         Args:
-            times: (n,) seconds of the frames of the mapper; finished: whether no more come.
+            index: of the frame in its source; time: seconds.
+
+        Raises:
+            InputError: the frame has no time, or one before that of the last frame.
         """
+        if time is None:
+            raise InputError(f"frame {index} has no time; an IMU needs those of all frames, as a video file has them")
+        if self._times and not time > self._times[-1]:
+            raise InputError(f"frame {index} is at {time:g} s, after one at {self._times[-1]:g} s; times must ascend")
+        last = [image.tracks.position for image in mapper.images if image.keyframe][-1:]
+        return bool(last) and time - self._times[last[0]] >= _LONGEST_INTERVAL
+
+    def follow(self, mapper: Mapper, time: float | None) -> None:
+        """After a frame, with its time: begin, or go on with the keyframes that the map has taken over since."""
+        assert time is not None
+        self._times.append(time)
+        self._add_factors(mapper, finished=False)
+
+    def finish(self, mapper: Mapper) -> None:
+        """No more frames come: take part, if that is possible at last."""
+        if mapper.started:
+            self._add_factors(mapper, finished=True)
+
+    def _add_factors(self, mapper: Mapper, *, finished: bool) -> None:
+        times = self._times
         if mapper.starts_anew:
             self._last, self.reason = None, "the map was started anew"
         if len(mapper.keyframes) == self._seen and not finished:
@@ -119,19 +157,6 @@ class ImuSource:
             frames, time = (before.tracks.frame, after.tracks.frame), (times[self._last], times[position])
             mapper.add_factors(*next_inertial_factor(self.recording, frames, time, before.pose, state))
             self._last = position
-
-
-def frame_times(timestamps: Sequence[float | None]) -> list[float]:
-    """Times of frames, seconds.
-
-    Raises:
-        InputError: a frame has none.
-    """
-    times = [time for time in timestamps if time is not None]
-    if len(times) < len(timestamps):
-        missing = next(k for k, time in enumerate(timestamps) if time is None)
-        raise InputError(f"frame {missing} has no time; an IMU needs those of all frames, as a video file has them")
-    return times
 
 
 def _spaced(keyframes: Sequence[int], times: Sequence[float]) -> list[int]:

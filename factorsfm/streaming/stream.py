@@ -31,8 +31,8 @@ from factorsfm.priors.read_priors import read_depth, read_mask
 from factorsfm.report.thumbnails import Thumbnails
 from factorsfm.result.reconstruction import Reconstruction
 from factorsfm.streaming.finishing import EndedShot
-from factorsfm.streaming.frame_update import FrameUpdate, SeenFrame, frame_results, frame_update, pose_of
-from factorsfm.streaming.imu_source import ImuSource, frame_times
+from factorsfm.streaming.frame_update import FrameIndices, FrameUpdate, SeenFrame, frame_results, frame_update, pose_of
+from factorsfm.streaming.imu_source import ImuSource
 from factorsfm.streaming.snapshot import read_snapshot, write_snapshot
 from factorsfm.streaming.view_finder import ViewFinder
 from factorsfm.support.context import Closing
@@ -103,7 +103,7 @@ class Stream(Closing):
         self._size = (0, 0)
         self._colors = TrackColors()
         self._without_depth: dict[int, str] = {}  # why the prior failed, by the frame's index
-        self._taken: set[int] = set()  # indices that name the variables of frames
+        self._indices = FrameIndices()
 
     def push(self, frame: Frame | NDArray[np.uint8], *, keyframe: bool = False) -> FrameUpdate:
         """Take the next frame.
@@ -137,16 +137,15 @@ class Stream(Closing):
             mapper.advance()
         focal_changed |= self._follow_focal(mapper)
         tracks = ImageTracks(
-            len(self.frames), tracked.ids, tracked.xy, self.camera, index=self._free_index(frame.index)
+            len(self.frames), tracked.ids, tracked.xy, self.camera, index=self._indices.take(frame.index)
         )
         tracks = tracks.of(tracks.invertible & (tracked.texture >= BLANK_TEXTURE))  # a blank image's tracks are noise
         with self.seconds.of("mapping"):
             if self._imu is not None:
-                times = frame_times([*(seen.timestamp for seen in self.frames), frame.timestamp])
-                keyframe = keyframe or self._imu.wants_keyframe(mapper, times)
+                keyframe |= self._imu.wants_keyframe(mapper, frame.index, frame.timestamp)
             image = mapper.add(tracks, lambda: self._read_depth(frame, tracks.pixels), keyframe=keyframe)
             if self._imu is not None:
-                self._imu.follow(mapper, times)
+                self._imu.follow(mapper, frame.timestamp)
         focal_changed |= self._follow_focal(mapper)
         self.frames.append(SeenFrame(frame.index, frame.name, frame.timestamp, tracked.texture))
         self._thumbnails.add(frame.image)
@@ -254,15 +253,23 @@ class Stream(Closing):
                 "thumbnails": self._thumbnails.state(),
                 "next_view": self._finder.relocalizer.next_view,
                 "mapper": self._mapper.state() if self._mapper is not None else None,
+                "imu": self._imu.state() if self._imu is not None else None,
             },
         )
 
     @classmethod
-    def load(cls, path: str | Path, *, depth: DepthPrior | None = None, masks: MaskPrior | None = None) -> Stream:
+    def load(
+        cls,
+        path: str | Path,
+        *,
+        depth: DepthPrior | None = None,
+        masks: MaskPrior | None = None,
+        imu: ImuRecording | None = None,
+    ) -> Stream:
         """Go on where a stream was saved; the next frame to push is number `len(stream.frames)`.
 
         Args:
-            path: of the snapshot; depth, masks: the priors that the stream had.
+            path: of the snapshot; depth, masks, imu: what the stream had.
 
         Raises:
             InputError: the file cannot be read, is torn, or is no snapshot.
@@ -270,7 +277,7 @@ class Stream(Closing):
         state = read_snapshot(Path(path))
         try:
             with ExitStack() as unless_restored:
-                stream = cls(depth=depth, masks=masks, options=Options.from_dict(state["options"]))
+                stream = cls(depth=depth, masks=masks, imu=imu, options=Options.from_dict(state["options"]))
                 unless_restored.enter_context(stream)
                 stream._restore(state)
                 unless_restored.pop_all()
@@ -283,7 +290,6 @@ class Stream(Closing):
             setattr(self, name, state[name])
         self.seconds.update(state["seconds"])
         self.frames = [SeenFrame(*frame) for frame in state["frames"]]
-        self._taken = {image.tracks.frame for image in state["mapper"]["images"]} if state["mapper"] else set()
         self._tracker.restore(state["tracker"])
         self._finder = ViewFinder(self._tracker, state["views"], state["next_view"])
         self._colors = TrackColors(state["colors"])
@@ -291,6 +297,9 @@ class Stream(Closing):
         if state["mapper"] is not None:
             self._mapper = self._new_mapper()
             self._mapper.restore(state["mapper"])
+            self._indices = FrameIndices(image.tracks.frame for image in self._mapper.images)
+        if (imu := state["imu"]) is not None and self._imu is not None:
+            self._imu.restore(imu)
 
     def finish(self, progress: Progress | None = None) -> Reconstruction:
         """Polish over all frames and tracks.
@@ -314,7 +323,7 @@ class Stream(Closing):
         if self._mapper is None or len(self.frames) < 2:
             raise ReconstructionError(f"frames in the shot: {len(self.frames)}, at least 2 needed")
         with self.seconds.of("mapping"):
-            self._mapper.finish(self._follow_imu)
+            self._mapper.finish(self._imu.finish if self._imu is not None else lambda mapper: None)
         self._follow_focal(self._mapper)
         for position, seen in enumerate(self.frames):
             _mark_blank(self._mapper, position, seen.texture)
@@ -332,10 +341,6 @@ class Stream(Closing):
             options=self.options,
             seconds=self.seconds,
         )
-
-    def _follow_imu(self) -> None:
-        if self._imu is not None and self._mapper is not None and self._mapper.started:
-            self._imu.follow(self._mapper, frame_times([seen.timestamp for seen in self.frames]), finished=True)
 
     def close(self) -> None:
         """End all threads and processes of the stream, with a result or without; `finish` closes, too."""
@@ -370,13 +375,6 @@ class Stream(Closing):
         self._held.enter_context(OneThreadEach())
         focal = 0.5 * (self.camera.focal_length_x + self.camera.focal_length_y)
         return Mapper(self._graph, focal, self._size[0], self.options, has_prior=self._depth is not None)
-
-    def _free_index(self, index: int) -> int:
-        """The index that names a frame's variables: its own, or the next free one where another frame has that."""
-        if index in self._taken or index < 0:
-            index = max(self._taken, default=-1) + 1
-        self._taken.add(index)
-        return index
 
     def _read_depth(self, frame: Frame, xy: NDArray[np.float64]) -> ImageDepth | None:
         """The prior at keypoints; once there is a map, a frame on which it fails goes without."""

@@ -127,6 +127,26 @@ def test_frames_that_show_nothing_get_the_pose_of_the_imu(tmp_path):
 
 
 @pytest.mark.slow
+def test_it_goes_on_after_a_snapshot(tmp_path):
+    imu, every = unknown(recording()), list(frames())
+    with Stream(CAMERA, imu=imu) as stream:
+        for frame in every[:70]:
+            stream.push(frame)
+        assert stream._imu.takes_part
+        stream.save(tmp_path / "snapshot")
+    with Stream.load(tmp_path / "snapshot", imu=imu) as stream:
+        for frame in every[70:]:
+            stream.push(frame)
+        result = stream.finish()
+    assert result.imu is not None
+    centers = pose_arrays([frame.cam_from_world for frame in result.frames])[1]
+    true = truth()[1]
+    ratio = np.linalg.norm(centers - centers[0], axis=1).sum() / np.linalg.norm(true - true[0], axis=1).sum()
+    assert ratio == pytest.approx(1.0, abs=0.015)
+    assert len([r for r in result.control.residuals if r.name.startswith("CombinedImuFactor")]) > 10
+
+
+@pytest.mark.slow
 def test_a_recording_of_something_else_is_refused_with_numbers():
     other = unknown(recording(handheld_path(SECONDS + 0.5, 78), 5))
     result = reconstruct(frames(), camera=CAMERA, depth=None, imu=other)
