@@ -64,6 +64,11 @@ class AddedFactors:
         return values
 
     @property
+    def own_names(self) -> set[int]:
+        """The variables of the caller's own."""
+        return set(self.values().keys())
+
+    @property
     def named(self) -> set[int]:
         """The graph's variables that they name."""
         return {key for key in keys_of(self.graph()) if not is_own(key)} if self.numbers else set()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import gtsam
 import numpy as np
@@ -25,12 +25,18 @@ _LEAST_INFORMATION = 1e-10  # smallest eigenvalue of what is determined, where e
 
 
 def checked_factors(
-    graph: object, values: object, present: MapValues, earlier: Sequence[AddedFactors], first: int
+    graph: object,
+    values: object,
+    present: MapValues,
+    earlier: Sequence[AddedFactors],
+    names: Collection[int],
+    first: int,
 ) -> AddedFactors:
     """Factors of the caller's, numbered.
 
     Args:
-        earlier: what was added before; first: number of the first factor.
+        earlier: what was added before and is still in use; names: all variables of the caller's own so far.
+        first: number of the first factor.
 
     Raises:
         InputError: another type; a Python callback; an unknown key, or one that is taken; values that are not
@@ -47,23 +53,27 @@ def checked_factors(
     for added in earlier:
         own = added.values()
         known.insert(part_of(own, [key for key in list(own.keys()) if not known.exists(key)]))
-    _check_keys(graph, values, known)
+    _check_keys(graph, values, known, names)
     _check_determined(graph, values, part_of(known, keys_of(graph)))
     return AddedFactors.of(range(first, first + graph.size()), graph, values)
 
 
-def _check_keys(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, present: gtsam.Values) -> None:
+def _check_keys(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, present: gtsam.Values, names: Collection[int]
+) -> None:
     for key in list(values.keys()):
         if not is_own(key):
             letters = ", ".join(RESERVED)
             raise InputError(
                 f"a value is given for {name_of(key)}; variables with the letters {letters} are the graph's"
             )
-        if present.exists(key):
+        if key in names:
             raise InputError(f"a value is given for {name_of(key)}, which was added before")
     for key in sorted(keys_of(graph)):
         if not values.exists(key) and not present.exists(key):
             needed = "no value is given for it" if is_own(key) else f"it is not {RESERVED[letter_of(key)]}"
+            if key in names:
+                needed = "all keyframes that it has to do with have become constant"
             raise InputError(f"unknown key {name_of(key)}: {needed}")
 
 

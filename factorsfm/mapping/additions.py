@@ -27,22 +27,25 @@ class Additions:
         self.offered: list[AddedFactors] = []
         self.active = NOTHING_ADDED
         self._following = 0  # number of the next factor
+        self._names: set[int] = set()  # all variables of the caller's own
 
     def state(self) -> dict[str, Any]:
         """Everything that `restore` needs."""
         return {
             "taken": self.taken, "offered": self.offered, "active": self.active, "following": self._following,
+            "names": sorted(self._names),
         }  # fmt: skip
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Go on where `state` was taken."""
         self.taken, self.offered = list(state["taken"]), list(state["offered"])
-        self.active, self._following = state["active"], state["following"]
+        self.active, self._following, self._names = state["active"], state["following"], set(state["names"])
 
     def offer(self, graph: object, values: object, contents: MapContents) -> None:
         """Check factors, and let the next update take them; errors as in `checked_factors`."""
-        earlier = [self.active, *self.offered, *self.taken]
-        added = checked_factors(graph, values, contents, earlier, self._following)
+        earlier = [self.active, *self.offered]
+        added = checked_factors(graph, values, contents, earlier, self._names, self._following)
+        self._names |= added.own_names
         self._following += len(added.numbers)
         self.offered.append(added)
 
@@ -62,6 +65,7 @@ class Additions:
         self.active = update.added
         self._following = max([self._following, *(number + 1 for number in update.added.numbers)])
         if update.refused:
+            self._names -= {name for added in offered for name in added.own_names}
             logger.warning(update.refused)
             return update.refused
         self.taken += offered

@@ -53,7 +53,9 @@ def values_of(**values):
 
 
 def checked(graph, values=None, earlier=(), first=0):
-    return checked_factors(graph, values if values is not None else gtsam.Values(), Contents(), list(earlier), first)
+    names = {name for added in earlier for name in added.own_names}
+    values = values if values is not None else gtsam.Values()
+    return checked_factors(graph, values, Contents(), list(earlier), names, first)
 
 
 def between(i, j, truth, noise=NOISE):
@@ -113,6 +115,8 @@ def test_a_variable_is_added_once_and_known_from_then_on():
     with pytest.raises(InputError, match="a value is given for v0, which was added before"):
         checked(graph_of(prior), values_of(v0=np.ones(3)), [first])
     assert checked(graph_of(prior), None, [first], 1).numbers == (1,)
+    with pytest.raises(InputError, match="unknown key v0: all keyframes that it has to do with have become constant"):
+        checked_factors(graph_of(prior), gtsam.Values(), Contents(), [], {V(0)}, 1)
 
 
 # --- what becomes constant --------------------------------------------------------------------------------------
