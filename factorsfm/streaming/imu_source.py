@@ -90,8 +90,8 @@ class ImuSource:
             raise InputError(f"frame {index} has no time; an IMU needs those of all frames, as a video file has them")
         if self._times and not time > self._times[-1]:
             raise InputError(f"frame {index} is at {time:g} s, after one at {self._times[-1]:g} s; times must ascend")
-        last = [image.tracks.position for image in mapper.images if image.keyframe][-1:]
-        return bool(last) and time - self._times[last[0]] >= _LONGEST_INTERVAL
+        last = next((image.tracks.position for image in reversed(mapper.images) if image.keyframe), None)
+        return last is not None and time - self._times[last] >= _LONGEST_INTERVAL
 
     def follow(self, mapper: Mapper, time: float | None) -> None:
         """After a frame, with its time: begin, or go on with the keyframes that the map has taken over since."""
