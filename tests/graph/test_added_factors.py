@@ -96,7 +96,28 @@ REFUSED = {
         values_of(p0=gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, 1.0]))), "indeterminate: the factors do not determi",
     ),
     "nan": (
-        graph_of(gtsam.PriorFactorPose3(X(0), gtsam.Pose3(gtsam.Rot3(), np.full(3, np.nan)), NOISE)), None, "not fini",
+        graph_of(gtsam.PriorFactorPose3(X(0), gtsam.Pose3(gtsam.Rot3(), np.full(3, np.nan)), NOISE)), None,
+        "factor 0, a PriorFactorPose3, holds a number that is not finite",
+    ),
+    "overflow": (
+        graph_of(gtsam.GPSFactor(X(0), np.full(3, 1e300), UNIT_3)), None,
+        "factor 0, a GPSFactor, is not finite at the given values",
+    ),
+    "infinity": (
+        graph_of(gtsam.GPSFactor(X(0), np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, np.inf))), None,
+        "factor 0, a GPSFactor, holds a number that is not finite",
+    ),
+    "another type": (
+        graph_of(gtsam.PriorFactorPoint3(X(0), np.zeros(3), UNIT_3)), None,
+        'factor 0, a PriorFactorPoint3, cannot be evaluated: .* key "x0", type stored in Values is .*Pose3',
+    ),
+    "own of another type": (
+        graph_of(gtsam.PriorFactorPose3(P(0), gtsam.Pose3(), NOISE)), values_of(p0=np.zeros(3)),
+        'factor 0, a PriorFactorPose3, cannot be evaluated: .* key "p0"',
+    ),
+    "constraint": (
+        graph_of(gtsam.BetweenFactorPose3(X(0), X(1), gtsam.Pose3(), gtsam.noiseModel.Constrained.All(6))), None,
+        "factor 0, a BetweenFactorPose3, has a standard deviation of zero; a small one is expected",
     ),
 }  # fmt: skip
 
