@@ -140,7 +140,8 @@ def control_notes(fit: ControlFit) -> list[str]:
     ]
     if wrong:
         worst = sorted(wrong, key=lambda r: -r.sigmas)[:3]
-        said = "; ".join(f"{r.name} by {r.error:.3g} {r.unit} or {r.sigmas:.0f} sigma" for r in worst)
+        sizes = ["" if r.unit == "sigma" else f"{r.error:.3g} {r.unit} or " for r in worst]
+        said = "; ".join(f"{r.name} by {size}{r.sigmas:.0f} sigma" for r, size in zip(worst, sizes, strict=True))
         notes.append(f"{len(wrong)} {item} contradict the images and the others: {said}.")
     if fit.unused:
         notes.append(f"Not used of the control: {'; '.join(fit.unused[:3])}.")
