@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -37,9 +38,14 @@ class ImuSource:
     Attributes:
         timing: the fit of its clock and axes, once there is one.
         reason: why it takes no part yet, empty while it does.
+
+    Raises:
+        InputError: another type.
     """
 
     def __init__(self, recording: ImuRecording) -> None:
+        if not isinstance(recording, ImuRecording):
+            raise InputError(f"the IMU is of type {type(recording).__name__}; the ImuRecording of open_imu is expected")
         self._given = recording
         self.timing: ImuTiming | None = None
         self.reason = "the video has not begun"
@@ -125,11 +131,11 @@ def frame_times(timestamps: Sequence[float | None]) -> list[float]:
     """Times of frames, seconds.
 
     Raises:
-        InputError: a frame has none.
+        InputError: a frame has none, or one that is not finite.
     """
-    times = [time for time in timestamps if time is not None]
+    times = [time for time in timestamps if time is not None and math.isfinite(time)]
     if len(times) < len(timestamps):
-        missing = next(k for k, time in enumerate(timestamps) if time is None)
+        missing = next(k for k, time in enumerate(timestamps) if time is None or not math.isfinite(time))
         raise InputError(f"frame {missing} has no time; an IMU needs those of all frames, as a video file has them")
     return times
 

@@ -117,9 +117,10 @@ class Stream(Closing):
                 a prior fails on it (the depth prior: before there is a map, later the frame goes without); the stream
                 can go on with another frame, unless it is closed.
         """
-        if self._closed:
-            raise InputError("the stream is closed and takes no further frame")
+        self._check_open("takes no further frame")
         frame = as_frame(frame, len(self.frames))
+        timestamps = [*(seen.timestamp for seen in self.frames), frame.timestamp]
+        times = frame_times(timestamps) if self._imu is not None else []
         mapper = self._mapper or self._open(frame)
         focal_changed = self._follow_focal(mapper)
         if frame.image.shape[1::-1] != self._size:
@@ -142,7 +143,6 @@ class Stream(Closing):
         tracks = tracks.of(tracks.invertible & (tracked.texture >= BLANK_TEXTURE))  # a blank image's tracks are noise
         with self.seconds.of("mapping"):
             if self._imu is not None:
-                times = frame_times([*(seen.timestamp for seen in self.frames), frame.timestamp])
                 keyframe = keyframe or self._imu.wants_keyframe(mapper, times)
             image = mapper.add(tracks, lambda: self._read_depth(frame, tracks.pixels), keyframe=keyframe)
             if self._imu is not None:
@@ -176,7 +176,11 @@ class Stream(Closing):
         (`world_from_cam`) of the frame with index i, where that is a keyframe (`keyframes`); ``L(j)`` the landmark of
         track j; ``A(i)`` scale and shift of the depth map of frame i (`graph.factors.affine_of_native`); ``K(0)`` the
         lens where it is not known. An index that came twice counts on from the largest one.
+
+        Raises:
+            InputError: the stream is closed, as by `finish`.
         """
+        self._check_open("has no graph any more")
         return self._mapper.graph() if self._mapper is not None else empty_graph()
 
     def add_factors(self, graph: Factors, values: Values) -> None:
@@ -193,9 +197,10 @@ class Stream(Closing):
 
         Raises:
             InputError: a factor cannot be taken (Python callback, unknown key, key that is in use, variables that are
-                left open), or the stream has control or no map yet. Where the images contradict the factors only the
-                update finds out: `FrameUpdate.note` then says that they are refused.
+                left open), or the stream is closed, has control or no map yet. Where the images contradict the factors
+                only the update finds out: `FrameUpdate.note` then says that they are refused.
         """
+        self._check_open("takes no factors")
         if self.control is not None:
             raise InputError("a stream with control takes no factors; say of the control what the factors would")
         if self._mapper is None or not self._mapper.started:
@@ -341,6 +346,10 @@ class Stream(Closing):
         """End all threads and processes of the stream, with a result or without; `finish` closes, too."""
         self._closed = True
         self._held.close()
+
+    def _check_open(self, what: str) -> None:
+        if self._closed:
+            raise InputError(f"the stream is closed and {what}")
 
     def _open(self, frame: Frame) -> Mapper:
         """Everything that waits for the size of the first frame."""

@@ -141,6 +141,15 @@ def test_frames_without_times_and_sets_are_refused():
     imu = recording()
     with Stream(CAMERA, imu=imu) as stream, pytest.raises(InputError, match="frame 0 has no time; an IMU needs those"):
         stream.push(images()[0])
+    with Stream(CAMERA, imu=imu) as stream:
+        stream.push(Frame(0, images()[0], "0", timestamp=0.0))
+        for none in (None, float("nan")):
+            with pytest.raises(InputError, match="frame 1 has no time"):
+                stream.push(Frame(1, images()[1], "1", timestamp=none))
+        stream.push(Frame(1, images()[1], "1", timestamp=1 / FPS))
+        assert [image.tracks.frame for image in stream._mapper.images] == [0, 1]  # as if they had not come
+    with pytest.raises(InputError, match="the IMU is of type str; the ImuRecording of open_imu is expected"):
+        Stream(CAMERA, imu="imu.csv")
     with pytest.raises(InputError, match="an IMU goes with a video"):
         reconstruct(frames(), camera=CAMERA, depth=None, imu=imu, unordered=True)
     control = Control(distances=[KnownDistance(length=1.0, sigma=0.1, frames=(0, 5))])
