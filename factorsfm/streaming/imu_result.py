@@ -54,9 +54,11 @@ def add_imu(result: Reconstruction, imu: ImuSource, factors: FactorsOnPoses | No
 
 
 def _note(fit: ImuFit) -> str:
+    offset, std = abs(fit.time_offset), fit.time_offset_std
+    size = f"{1e3 * offset:.1f} ± {1e3 * std:.1f} ms" if offset < 10.0 else f"{offset:.4f} ± {std:.4f} s"
     note = (
         f"IMU: lengths are metres, known to {100 * fit.scale_std:.2g} %; up to {fit.up_std:.2g} degrees; its clock is "
-        f"{1e3 * fit.time_offset:.1f} ± {1e3 * fit.time_offset_std:.1f} ms behind the video's."
+        f"{size} {'behind' if fit.time_offset >= 0 else 'ahead of'} the video's."
     )
     return note + (f" The poses of {fit.frames} frames that show nothing are its own." if fit.frames else "")
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,7 @@ _AGAIN_SECONDS = 0.5  # after an attempt that failed
 _MOST_KEYFRAMES = 30  # of the alignment, the newest ones
 _LEAST_INTERVAL, _LONGEST_INTERVAL = 0.15, 0.5  # seconds between keyframes with a factor, and between keyframes at all
 _LARGEST_SCALE_STD = 0.05  # of the logarithm, with which the factors begin
+_STATE = ("timing", "reason", "_last", "_attempt", "_seen")
 _EXACT = 1e-12  # variance of the pose of the first keyframe, which is the world
 
 
@@ -52,6 +54,15 @@ class ImuSource:
         self._last: int | None = None  # position of the newest keyframe with a factor
         self._attempt = -np.inf  # time of the last one to begin
         self._seen = 0  # keyframes of the map so far
+
+    def state(self) -> dict[str, Any]:
+        """Everything that `restore` needs beside the recording."""
+        return {name: getattr(self, name) for name in _STATE}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go on where `state` was taken."""
+        for name in _STATE:
+            setattr(self, name, state[name])
 
     @property
     def recording(self) -> ImuRecording:
@@ -105,6 +116,8 @@ class ImuSource:
             return
         self._attempt = times[-1]
         self.timing = fit_timing(self._given, np.array(times), _rotations(mapper.images))
+        start, end = self.recording.time[[0, -1]] + self.timing.time_offset
+        positions = [position for position in positions if start <= times[position] <= end]
         images = [mapper.images[position] for position in positions]
         time = np.array([times[position] for position in positions])
         alignment = align_inertial(self.recording, _visual_poses(images, time))

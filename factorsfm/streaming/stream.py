@@ -259,23 +259,31 @@ class Stream(Closing):
                 "thumbnails": self._thumbnails.state(),
                 "next_view": self._finder.relocalizer.next_view,
                 "mapper": self._mapper.state() if self._mapper is not None else None,
+                "imu": self._imu.state() if self._imu is not None else None,
             },
         )
 
     @classmethod
-    def load(cls, path: str | Path, *, depth: DepthPrior | None = None, masks: MaskPrior | None = None) -> Stream:
+    def load(
+        cls,
+        path: str | Path,
+        *,
+        depth: DepthPrior | None = None,
+        masks: MaskPrior | None = None,
+        imu: ImuRecording | None = None,
+    ) -> Stream:
         """Go on where a stream was saved; the next frame to push is number `len(stream.frames)`.
 
         Args:
-            path: of the snapshot; depth, masks: the priors that the stream had.
+            path: of the snapshot; depth, masks, imu: the priors and the recording that the stream had.
 
         Raises:
-            InputError: the file cannot be read, is torn, or is no snapshot.
+            InputError: the file cannot be read, is torn, or is no snapshot; the stream had an IMU and none is given.
         """
         state = read_snapshot(Path(path))
         try:
             with ExitStack() as unless_restored:
-                stream = cls(depth=depth, masks=masks, options=Options.from_dict(state["options"]))
+                stream = cls(depth=depth, masks=masks, imu=imu, options=Options.from_dict(state["options"]))
                 unless_restored.enter_context(stream)
                 stream._restore(state)
                 unless_restored.pop_all()
@@ -296,6 +304,10 @@ class Stream(Closing):
         if state["mapper"] is not None:
             self._mapper = self._new_mapper()
             self._mapper.restore(state["mapper"])
+        if state["imu"] is not None:
+            if self._imu is None:
+                raise InputError("the snapshot is of a stream with an IMU; its recording must be given, too")
+            self._imu.restore(state["imu"])
 
     def finish(self, progress: Progress | None = None) -> Reconstruction:
         """Polish over all frames and tracks.

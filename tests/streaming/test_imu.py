@@ -1,5 +1,6 @@
 """An IMU beside a stream: metric scale, up, poses of frames that show nothing; and recordings that do not fit."""
 
+import itertools
 import json
 from dataclasses import replace
 from functools import cache
@@ -20,6 +21,8 @@ from factorsfm import (
     read_result,
     reconstruct,
 )
+from factorsfm.inertial.fit import ImuFit
+from factorsfm.streaming.imu_result import _note
 from factorsfm.support.rotations import exponential
 from factorsfm.support.similarity import pose_arrays
 from factorsfm.synthetic import handheld_path, simulate_imu
@@ -124,6 +127,48 @@ def test_frames_that_show_nothing_get_the_pose_of_the_imu(tmp_path):
     back = read_result(tmp_path / "out")
     assert back.imu == result.imu
     assert sum(frame.registered for frame in back.frames) == len(TIMES)
+
+
+@pytest.mark.slow
+def test_a_recording_that_starts_late_and_a_snapshot(tmp_path):
+    whole = recording()
+    part = whole.time > 1.2
+    imu = unknown(replace(
+        whole, time=whole.time[part], gyroscope=whole.gyroscope[part], accelerometer=whole.accelerometer[part],
+    ))  # fmt: skip
+    with Stream(CAMERA, imu=imu) as stream:
+        for frame in itertools.islice(frames(), 100):
+            stream.push(frame)
+        assert stream._imu.takes_part
+        stream.save(tmp_path / "snapshot")
+    with pytest.raises(InputError, match="the snapshot is of a stream with an IMU; its recording must be given, too"):
+        Stream.load(tmp_path / "snapshot")
+    with Stream.load(tmp_path / "snapshot", imu=imu) as stream:
+        assert stream._imu.takes_part
+        for frame in itertools.islice(frames(), 100, None):
+            stream.push(frame)
+        result = stream.finish()
+    assert result.metric
+    assert 0.004 < result.imu.scale_std < 0.012
+    assert result.imu.time_offset == pytest.approx(OFFSET, abs=1e-3)
+    centers = result.camera_centers()
+    length, true = (np.linalg.norm(c[-1] - c[0]) for c in (centers, truth()[1]))
+    assert length == pytest.approx(true, rel=3 * result.imu.scale_std)
+
+
+@pytest.mark.parametrize(
+    ("offset", "said"),
+    [
+        (0.317, "its clock is 317.0 ± 0.2 ms behind the video's"),
+        (-1.7e9, "its clock is 1700000000.0000 ± 0.0002 s ahead of the video's"),
+    ],
+)
+def test_clocks_are_told_in_a_fitting_unit(offset, said):
+    fit = ImuFit(
+        up=[0, -1, 0], up_std=0.1, scale_std=0.006, cam_from_imu=np.eye(3).tolist(), rotation_std=0.1,
+        time_offset=offset, time_offset_std=2e-4, gyroscope_bias=[0, 0, 0], accelerometer_bias=[0, 0, 0], frames=0,
+    )  # fmt: skip
+    assert said in _note(fit)
 
 
 @pytest.mark.slow
