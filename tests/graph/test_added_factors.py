@@ -212,6 +212,21 @@ def test_the_unit_of_length_is_that_of_the_factors(unit):
     assert std == pytest.approx(0.01 * unit / np.sqrt((steps**2).sum()), rel=1e-3)
 
 
+def test_positions_in_another_world_determine_no_unit():
+    """As fixes are, whose axes are not those of the first camera; noise makes a unit as uncertain as it is large."""
+    truth, sigma = Contents(5.0), gtsam.noiseModel.Isotropic.Sigma(3, 0.01)
+    world = gtsam.Pose3(gtsam.Rot3.Ypr(0.3, 0.2, 1.0), np.array([412.0, -77.0, 30.0]))
+    fixes = [world.compose(pose).translation() for pose in truth.poses]
+    graph = graph_of(*(gtsam.GPSFactor(X(k), fix, sigma) for k, fix in enumerate(fixes)))
+    assert unit_of_length(AddedFactors.of(range(FRAMES), graph, gtsam.Values()), Contents()) == (1.0, np.inf)
+    noisy = [pose.translation() + 0.1 * (-1.0) ** k for k, pose in enumerate(truth.poses)]
+    graph = graph_of(*(gtsam.GPSFactor(X(k), place, sigma) for k, place in enumerate(noisy)))
+    found, std = unit_of_length(AddedFactors.of(range(FRAMES), graph, gtsam.Values()), Contents())
+    size = np.linalg.norm([pose.translation() for pose in truth.poses])
+    assert found == pytest.approx(5.0, abs=15 * std)
+    assert std == pytest.approx(0.1 / size, rel=0.2)
+
+
 def test_variables_of_the_caller_follow_the_unit():
     """A point of the caller's own at known ranges of all poses, which begins in the wrong unit."""
     truth, place, sigma = Contents(5.0), np.array([20.0, 15.0, 2.0]), gtsam.noiseModel.Isotropic.Sigma(1, 0.01)
