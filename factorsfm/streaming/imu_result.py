@@ -25,14 +25,16 @@ _LONGEST_GAP = 3.0  # seconds
 _LARGEST_ROTATION_STD = np.radians(3.0)
 
 
-def add_imu(result: Reconstruction, imu: ImuSource, factors: FactorsOnPoses | None) -> None:
+def add_imu(result: Reconstruction, imu: ImuSource, factors: FactorsOnPoses | None, *, lens_given: bool) -> None:
     """Give a result what the IMU says of it, and a note.
 
     Args:
-        factors: on the poses of the result, None where the IMU took no part.
+        factors: on the poses of the result, None where the IMU took no part; lens_given: whether the lens was known.
     """
-    if factors is None or not imu.takes_part or imu.timing is None or result.control is None:
-        result.notes.append(f"IMU: it takes no part: {imu.reason or 'the camera does not move'}.")
+    if factors is None or not imu.takes_part or imu.timing is None or result.control is None or not result.metric:
+        open_unit = "the camera does not move" if result.control is None else "it leaves the unit of length open"
+        lens = "" if lens_given else "; the camera was not given, and the IMU needs its focal length from the start"
+        result.notes.append(f"IMU: it takes no part: {imu.reason or open_unit}{lens}.")
         return
     registered = {frame.index: frame for frame in result.registered}
     state, up_std = posterior_state(factors, {i: (_pose(f), f.covariance) for i, f in registered.items()})
