@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 logger = logging.getLogger(__name__)
 
 _FIRST_SECONDS, _FIRST_KEYFRAMES = 2.0, 8  # before which the motion hardly determines anything
-_AGAIN_SECONDS = 0.5  # after an attempt that failed
+_AGAIN_SECONDS, _AGAIN_SHARE = 0.5, 0.1  # after an attempt that failed: an attempt takes all frames so far
 _MOST_KEYFRAMES = 30  # of the alignment, the newest ones
 _LEAST_INTERVAL, _LONGEST_INTERVAL = 0.15, 0.5  # seconds between keyframes with a factor, and between keyframes at all
 _LARGEST_SCALE_STD = 0.05  # of the logarithm, with which the factors begin
@@ -111,7 +111,7 @@ class ImuSource:
         positions = _spaced(mapper.keyframes, times)[-_MOST_KEYFRAMES:]
         span = times[positions[-1]] - times[mapper.keyframes[0]] if positions else 0.0
         early = len(positions) < _FIRST_KEYFRAMES or span < _FIRST_SECONDS
-        if not finished and (early or times[-1] - self._attempt < _AGAIN_SECONDS):
+        if not finished and (early or times[-1] - self._attempt < max(_AGAIN_SECONDS, _AGAIN_SHARE * span)):
             self.reason = f"{len(positions)} keyframes in {span:.1f} s are too few to find its scale"
             return
         self._attempt = times[-1]

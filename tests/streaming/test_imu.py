@@ -4,6 +4,7 @@ import itertools
 import json
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,12 +18,15 @@ from factorsfm import (
     InputError,
     KnownDistance,
     Reconstruction,
+    ReconstructionError,
     Stream,
     read_result,
     reconstruct,
 )
 from factorsfm.inertial.fit import ImuFit
+from factorsfm.streaming import imu_source
 from factorsfm.streaming.imu_result import _note
+from factorsfm.streaming.imu_source import ImuSource
 from factorsfm.support.rotations import exponential
 from factorsfm.support.similarity import pose_arrays
 from factorsfm.synthetic import handheld_path, simulate_imu
@@ -210,3 +214,25 @@ def test_a_camera_that_does_not_accelerate_shows_no_scale():
     result = reconstruct(shot, camera=CAMERA, depth=None, imu=still)
     assert not result.metric
     assert any(note.startswith("IMU: it takes no part: ") for note in result.notes)
+
+
+def test_attempts_that_fail_become_rarer(monkeypatch):
+    """Each takes all frames so far: every half second of ten minutes they would take longer than the video."""
+    attempts = []
+
+    def fails(recording, times, rotations):
+        attempts.append(len(times))
+        raise ReconstructionError("it does not fit")
+
+    monkeypatch.setattr(imu_source, "fit_timing", fails)
+    source, mapper = ImuSource(recording()), SimpleNamespace(starts_anew=False, keyframes=[], images=[])
+    times = []
+    for k in range(1200):
+        times.append(k / 2)
+        mapper.keyframes.append(k)
+        source.follow(mapper, times)
+    assert 40 < len(attempts) < 80
+    assert max(np.diff(attempts)) < 120
+    source.follow(mapper, times, finished=True)
+    assert attempts[-1] == len(times)
+    assert source.reason == "it does not fit"
