@@ -18,7 +18,7 @@ from factorsfm.control.residuals import ALIGNMENT, AlignedState, ControlTerm, Ma
 
 Array = NDArray[np.float64]
 
-_TURN_STD, _SCALE_STD = 0.05, 0.3  # radians, and of the logarithm: from where on the factors know something of it
+_TURN_STD, SCALE_STD = 0.05, 0.3  # radians, and of the logarithm: from where on the factors know something of it
 _HELD = 1e12  # information of what is held
 
 
@@ -52,7 +52,7 @@ class FactorTerm:
         information, _ = self._quadratic(state)
         first = self.aligned(state).first
         size = 1.0 / max(float(information[first + 6, first + 6]), 1e-300)
-        self.determines_scale = bool(size < _SCALE_STD**2)
+        self.determines_scale = bool(size < SCALE_STD**2)
         known, axes = np.linalg.eigh(information[first : first + 3, first : first + 3])
         held = axes[:, known < _TURN_STD**-2.0]
         self._held = _HELD * held @ held.T

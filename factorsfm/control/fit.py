@@ -33,7 +33,8 @@ class ControlFit:
         unused: what could not be used, and why.
         placed: whether the result is in the world of the control; where only distances or heights are known, it is in
             that of its first camera.
-        scale_std: relative standard deviation of the scene's size in the control's unit.
+        scale_std: relative standard deviation of the scene's size in the control's unit, infinite where factors leave
+            the unit open.
         position_std: standard deviation of a camera's position in this world and unit, median over the cameras.
         source: "control", or "factors" where the caller added them to the live graph; the world is then that of the
             live map.

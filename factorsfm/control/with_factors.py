@@ -12,7 +12,7 @@ from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import Free, Known
 from factorsfm.adjustment.state import State
-from factorsfm.control.factor_term import FactorTerm, PoseFactors
+from factorsfm.control.factor_term import SCALE_STD, FactorTerm, PoseFactors
 from factorsfm.control.fit import ControlFit, ControlResidual
 from factorsfm.control.residuals import MarkItem, Place
 from factorsfm.control.solve import Controlled, described
@@ -75,7 +75,9 @@ def solve_with_factors(
     controlled = described(solved, term, lambda scale_std, position_std: ControlFit(
         residuals, [], [], placed=True, scale_std=scale_std, position_std=position_std, source="factors",
     ))  # fmt: skip
-    return controlled if term.determines_scale else replace(controlled, world_alignment=None)
+    if term.determines_scale and controlled.fit.scale_std < SCALE_STD:
+        return controlled
+    return replace(controlled, world_alignment=None, fit=replace(controlled.fit, placed=False, scale_std=np.inf))
 
 
 def _alignment(state: State, factors: ShotFactors, frames: list[int]) -> tuple[Array, Array, Array, float]:

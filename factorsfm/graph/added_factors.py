@@ -26,7 +26,7 @@ logger = logging.getLogger(__name__)
 HELD = 1e-6  # standard deviation of what is constant
 RESERVED = {
     "x": "a keyframe of the map", "l": "a landmark of the map", "a": "a keyframe with a depth map",
-    "k": "a variable of this map", "t": "a variable of this map",
+    "k": "a variable that takes added factors", "t": "a variable that takes added factors",
 }  # fmt: skip
 
 

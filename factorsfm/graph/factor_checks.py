@@ -39,8 +39,8 @@ def checked_factors(
         first: number of the first factor.
 
     Raises:
-        InputError: another type; a Python callback; an unknown key, or one that is taken; values that are not
-            finite; variables that the factors leave open.
+        InputError: another type; a Python callback; an unknown key, or one that is taken; a value of another type than
+            the factor expects; a standard deviation of zero; what is not finite; variables that the factors leave open.
     """
     if not isinstance(graph, gtsam.NonlinearFactorGraph) or not isinstance(values, gtsam.Values):
         raise InputError(
@@ -54,7 +54,10 @@ def checked_factors(
         own = added.values()
         known.insert(part_of(own, [key for key in list(own.keys()) if not known.exists(key)]))
     _check_keys(graph, values, known, names)
-    _check_determined(graph, values, part_of(known, keys_of(graph)))
+    everything = part_of(known, keys_of(graph))
+    everything.insert(values)
+    _check_linear(graph, everything)
+    _check_determined(graph, everything, sorted(values.keys()))
     return AddedFactors.of(range(first, first + graph.size()), graph, values)
 
 
@@ -84,18 +87,35 @@ def _check_crosses(factor: gtsam.NonlinearFactor | None, number: int) -> None:
         raise InputError(f"factor {number} is {kind}; only factors in C++ can cross to the process of the graph")
     alone.add(factor)
     try:
-        alone.serialize()
+        text = alone.serialize()
     except RuntimeError as error:
         raise InputError(f"factor {number}, a {type(factor).__name__}, cannot be serialised: {error}") from error
+    try:
+        alone.deserialize(text)
+    except RuntimeError as error:  # GTSAM writes infinity, and does not read it
+        raise InputError(f"factor {number}, a {type(factor).__name__}, holds a number that is not finite") from error
 
 
-def _check_determined(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, present: gtsam.Values) -> None:
+def _check_linear(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
+    """Factors are of the types of the values, finite, and no hard constraints, which the polish has no room for."""
+    for k in range(graph.size()):
+        factor, alone = graph.at(k), gtsam.NonlinearFactorGraph()
+        alone.add(factor)
+        name = f"factor {k}, a {type(factor).__name__}"
+        try:
+            error, linear = factor.error(values), alone.linearize(values)
+        except (RuntimeError, ValueError, IndexError) as wrong:  # of another type, or size, in GTSAM's words
+            raise InputError(f"{name}, cannot be evaluated: {str(wrong).strip()}") from wrong
+        try:
+            linear.hessian()
+        except ValueError as wrong:  # a constraint has none
+            raise InputError(f"{name}, has a standard deviation of zero; a small one is expected") from wrong
+        if not np.isfinite(error):
+            raise InputError(f"{name}, is not finite at the given values")
+
+
+def _check_determined(graph: gtsam.NonlinearFactorGraph, everything: gtsam.Values, own: list[int]) -> None:
     """The images determine the graph's variables: what remains are the new ones, by the new factors."""
-    everything = gtsam.Values(present)
-    everything.insert(values)
-    if not np.isfinite(graph.error(everything)):
-        raise InputError("the factors are not finite at the given values")
-    own = sorted(values.keys())
     if missing := [key for key in own if key not in keys_of(graph)]:
         raise InputError(f"indeterminate: no factor names {name_of(missing[0])}")
     if not own:

@@ -20,8 +20,9 @@ _STEPS, _TOLERANCE = 25, 1e-5
 def unit_of_length(added: AddedFactors, contents: MapValues) -> tuple[float, float]:
     """By what lengths must be multiplied to fit the factors, and the standard deviation of its logarithm.
 
-    Poses and landmarks are scaled as a whole, about the origin; the caller's own variables follow. 1 and infinity where
-    the factors say nothing of lengths.
+    Poses and landmarks are scaled as a whole, about the origin; the caller's own variables follow. The standard
+    deviation is larger by as much as the factors fit worse than their noise says: those that are in another world, or
+    contradict each other, determine no unit. 1 and infinity where the factors say nothing of lengths.
 
     Args:
         contents: of the map.
@@ -48,7 +49,13 @@ def unit_of_length(added: AddedFactors, contents: MapValues) -> tuple[float, flo
         own = own.retract(_as_vectors(step, system, keys))
         if abs(step[-1]) < _TOLERANCE:
             break
+    std *= _misfit(system.residual - design @ step, design.shape[1])
     return (unit, std) if std < _LARGEST_STD else (1.0, np.inf)
+
+
+def _misfit(residual: Array, unknowns: int) -> float:
+    """By what the residuals, in standard deviations, are larger than they should be; at least 1."""
+    return max(1.0, float(np.linalg.norm(residual) / np.sqrt(max(1, len(residual) - unknowns))))
 
 
 def _scaled(present: gtsam.Values, unit: float) -> gtsam.Values:

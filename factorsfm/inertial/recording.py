@@ -18,6 +18,7 @@ _LARGEST = 1e12  # of a number: its square stays finite
 _LOWEST_RATE = 50.0  # samples per second
 _LONGEST_GAP = 0.1  # seconds: interpolated over more, a hand's motion is lost
 _LARGEST_TURN = 10.0  # rad/s, median: no camera turns so fast for half of a shot, but one in degrees does
+_LONGEST_LEVER = 10.0  # metres
 _FORCE_RANGE = (0.5 * GRAVITY, 2.0 * GRAVITY)  # m/s^2, median
 
 
@@ -68,7 +69,7 @@ class ImuRecording:
 
     Raises:
         InputError: sizes that do not agree, values that are not finite, times that do not ascend, fewer than 50 samples
-            a second, a gap of more than 0.1 s, or magnitudes that no IMU in these units shows.
+            a second, a gap of more than 0.1 s, or magnitudes or a lever arm that no IMU in these units shows.
     """
 
     time: Array
@@ -87,6 +88,11 @@ class ImuRecording:
                 object.__setattr__(self, name, _checked(name, getattr(self, name), shape))
         if self.time_offset is not None and not np.isfinite(self.time_offset):
             raise InputError(f"the time offset of the IMU is {self.time_offset}; seconds are expected")
+        if (distance := float(np.linalg.norm(self.lever_arm))) > _LONGEST_LEVER:
+            raise InputError(
+                f"the IMU is {distance:.3g} m from the camera; at most {_LONGEST_LEVER:g} is expected "
+                "(millimetres instead of metres?)"
+            )
         if self.cam_from_imu is not None:
             _check_rotation(self.cam_from_imu)
         _check_times(self.time)

@@ -134,13 +134,15 @@ def control_notes(fit: ControlFit) -> list[str]:
         what, item, world = "Factors added", "factors", "The result is in the world of the live graph."
     elif fit.placed:
         world = "The result is in the control's world."
-    notes = [
-        f"{what}: {held}{len(good)} items used{size}; the scale is known to {100 * fit.scale_std:.2g} %, the position "
-        f"of a camera to {fit.position_std:.2g} m. {world}"
-    ]
+    scale, position = f"{100 * fit.scale_std:.2g} %", f"{fit.position_std:.2g} m"
+    known = f"the scale is known to {scale}, the position of a camera to {position}. {world}"
+    if not np.isfinite(fit.scale_std):
+        known = "they leave the unit of length open."
+    notes = [f"{what}: {held}{len(good)} items used{size}; {known}"]
     if wrong:
         worst = sorted(wrong, key=lambda r: -r.sigmas)[:3]
-        said = "; ".join(f"{r.name} by {r.error:.3g} {r.unit} or {r.sigmas:.0f} sigma" for r in worst)
+        sizes = ["" if r.unit == "sigma" else f"{r.error:.3g} {r.unit} or " for r in worst]
+        said = "; ".join(f"{r.name} by {size}{r.sigmas:.0f} sigma" for r, size in zip(worst, sizes, strict=True))
         notes.append(f"{len(wrong)} {item} contradict the images and the others: {said}.")
     if fit.unused:
         notes.append(f"Not used of the control: {'; '.join(fit.unused[:3])}.")

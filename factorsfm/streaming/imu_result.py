@@ -25,14 +25,16 @@ _LONGEST_GAP = 3.0  # seconds
 _LARGEST_ROTATION_STD = np.radians(3.0)
 
 
-def add_imu(result: Reconstruction, imu: ImuSource, factors: FactorsOnPoses | None) -> None:
+def add_imu(result: Reconstruction, imu: ImuSource, factors: FactorsOnPoses | None, *, lens_given: bool) -> None:
     """Give a result what the IMU says of it, and a note.
 
     Args:
-        factors: on the poses of the result, None where the IMU took no part.
+        factors: on the poses of the result, None where the IMU took no part; lens_given: whether the lens was known.
     """
-    if factors is None or not imu.takes_part or imu.timing is None or result.control is None:
-        result.notes.append(f"IMU: it takes no part: {imu.reason or 'the camera does not move'}.")
+    if factors is None or not imu.takes_part or imu.timing is None or result.control is None or not result.metric:
+        open_unit = "the camera does not move" if result.control is None else "it leaves the unit of length open"
+        lens = "" if lens_given else "; the camera was not given, and the IMU needs its focal length from the start"
+        result.notes.append(f"IMU: it takes no part: {imu.reason or open_unit}{lens}.")
         return
     registered = {frame.index: frame for frame in result.registered}
     state, up_std = posterior_state(factors, {i: (_pose(f), f.covariance) for i, f in registered.items()})
@@ -54,9 +56,11 @@ def add_imu(result: Reconstruction, imu: ImuSource, factors: FactorsOnPoses | No
 
 
 def _note(fit: ImuFit) -> str:
+    offset, std = abs(fit.time_offset), fit.time_offset_std
+    size = f"{1e3 * offset:.1f} ± {1e3 * std:.1f} ms" if offset < 10.0 else f"{offset:.4f} ± {std:.4f} s"
     note = (
         f"IMU: lengths are metres, known to {100 * fit.scale_std:.2g} %; up to {fit.up_std:.2g} degrees; its clock is "
-        f"{1e3 * fit.time_offset:.1f} ± {1e3 * fit.time_offset_std:.1f} ms behind the video's."
+        f"{size} {'behind' if fit.time_offset >= 0 else 'ahead of'} the video's."
     )
     return note + (f" The poses of {fit.frames} frames that show nothing are its own." if fit.frames else "")
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -23,10 +23,11 @@ Array = NDArray[np.float64]
 logger = logging.getLogger(__name__)
 
 _FIRST_SECONDS, _FIRST_KEYFRAMES = 2.0, 8  # before which the motion hardly determines anything
-_AGAIN_SECONDS = 0.5  # after an attempt that failed
+_AGAIN_SECONDS, _AGAIN_SHARE = 0.5, 0.1  # after an attempt that failed: an attempt takes all frames so far
 _MOST_KEYFRAMES = 30  # of the alignment, the newest ones
 _LEAST_INTERVAL, _LONGEST_INTERVAL = 0.15, 0.5  # seconds between keyframes with a factor, and between keyframes at all
 _LARGEST_SCALE_STD = 0.05  # of the logarithm, with which the factors begin
+_STATE = ("timing", "reason", "_last", "_attempt", "_seen", "_times")
 _EXACT = 1e-12  # variance of the pose of the first keyframe, which is the world
 
 
@@ -39,9 +40,14 @@ class ImuSource:
     Attributes:
         timing: the fit of its clock and axes, once there is one.
         reason: why it takes no part yet, empty while it does.
+
+    Raises:
+        InputError: another type.
     """
 
     def __init__(self, recording: ImuRecording) -> None:
+        if not isinstance(recording, ImuRecording):
+            raise InputError(f"the IMU is of type {type(recording).__name__}; the ImuRecording of open_imu is expected")
         self._given = recording
         self.timing: ImuTiming | None = None
         self.reason = "the video has not begun"
@@ -49,6 +55,15 @@ class ImuSource:
         self._attempt = -np.inf  # time of the last one to begin
         self._seen = 0  # keyframes of the map so far
         self._times: list[float] = []  # of the frames, seconds
+
+    def state(self) -> dict[str, Any]:
+        """Everything that `restore` needs beside the recording."""
+        return {name: getattr(self, name) for name in _STATE}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go on where `state` was taken."""
+        for name in _STATE:
+            setattr(self, name, state[name])
 
     @property
     def recording(self) -> ImuRecording:
@@ -60,42 +75,25 @@ class ImuSource:
         """Whether its factors are in the graph, or wait for the next update."""
         return self._last is not None
 
-    def state(self) -> dict[str, Any]:
-        """Everything but the recording that `restore` needs."""
-        return {
-            "timing": None if self.timing is None else asdict(self.timing),
-            "reason": self.reason,
-            "last": self._last,
-            "attempt": self._attempt,
-            "seen": self._seen,
-            "times": self._times,
-        }
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Go on where `state` was taken."""
-        self.timing = None if state["timing"] is None else ImuTiming(**state["timing"])
-        self.reason, self._last = state["reason"], state["last"]
-        self._attempt, self._seen, self._times = state["attempt"], state["seen"], list(state["times"])
-
-    def wants_keyframe(self, mapper: Mapper, index: int, time: float | None) -> bool:
-        """Whether the next frame shall be a keyframe, since the last one is long ago.
-
-        Args:
-            index: of the frame in its source; time: seconds.
+    def check_time(self, index: int, time: float | None) -> float:
+        """The time of the next frame, seconds.
 
         Raises:
-            InputError: the frame has no time, or one before that of the last frame.
+            InputError: it has none, or one before that of the last frame.
         """
-        if time is None:
+        if time is None or not math.isfinite(time):
             raise InputError(f"frame {index} has no time; an IMU needs those of all frames, as a video file has them")
         if self._times and not time > self._times[-1]:
             raise InputError(f"frame {index} is at {time:g} s, after one at {self._times[-1]:g} s; times must ascend")
+        return time
+
+    def wants_keyframe(self, mapper: Mapper, time: float) -> bool:
+        """Whether the next frame shall be a keyframe, since the last one is long ago."""
         last = next((image.tracks.position for image in reversed(mapper.images) if image.keyframe), None)
         return last is not None and time - self._times[last] >= _LONGEST_INTERVAL
 
-    def follow(self, mapper: Mapper, time: float | None) -> None:
+    def follow(self, mapper: Mapper, time: float) -> None:
         """After a frame, with its time: begin, or go on with the keyframes that the map has taken over since."""
-        assert time is not None
         self._times.append(time)
         self._add_factors(mapper, finished=False)
 
@@ -132,11 +130,13 @@ class ImuSource:
         positions = _spaced(mapper.keyframes, times)[-_MOST_KEYFRAMES:]
         span = times[positions[-1]] - times[mapper.keyframes[0]] if positions else 0.0
         early = len(positions) < _FIRST_KEYFRAMES or span < _FIRST_SECONDS
-        if not finished and (early or times[-1] - self._attempt < _AGAIN_SECONDS):
+        if not finished and (early or times[-1] - self._attempt < max(_AGAIN_SECONDS, _AGAIN_SHARE * span)):
             self.reason = f"{len(positions)} keyframes in {span:.1f} s are too few to find its scale"
             return
         self._attempt = times[-1]
         self.timing = fit_timing(self._given, np.array(times), _rotations(mapper.images))
+        start, end = self.recording.time[[0, -1]] + self.timing.time_offset
+        positions = [position for position in positions if start <= times[position] <= end]
         images = [mapper.images[position] for position in positions]
         time = np.array([times[position] for position in positions])
         alignment = align_inertial(self.recording, _visual_poses(images, time))

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from factorsfm.camera.files import camera_from_json, camera_to_json
 from factorsfm.graph.added_factors import AddedFactors
+from factorsfm.inertial.timing import ImuTiming
 from factorsfm.mapping.map_copy import MapUpdate
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.priors.image_depth import ImageDepth
@@ -31,7 +32,8 @@ _MAGIC = b"factorsfm-1\n"
 _CHECKSUM_BYTES = 32
 _DTYPES = {"bool", "uint8", "int32", "int64", "uint64", "float32", "float64"}
 _TYPES: dict[str, Any] = {
-    t.__name__: t for t in (AddedFactors, FrameStatus, ImageDepth, ImageTracks, MappedImage, MapUpdate, KeyframeView)
+    t.__name__: t
+    for t in (AddedFactors, FrameStatus, ImageDepth, ImageTracks, ImuTiming, KeyframeView, MappedImage, MapUpdate)
 }
 
 

@@ -117,9 +117,9 @@ class Stream(Closing):
                 a prior fails on it (the depth prior: before there is a map, later the frame goes without); the stream
                 can go on with another frame, unless it is closed.
         """
-        if self._closed:
-            raise InputError("the stream is closed and takes no further frame")
+        self._check_open("takes no further frame")
         frame = as_frame(frame, len(self.frames))
+        time = self._imu.check_time(frame.index, frame.timestamp) if self._imu is not None else 0.0
         mapper = self._mapper or self._open(frame)
         focal_changed = self._follow_focal(mapper)
         if frame.image.shape[1::-1] != self._size:
@@ -142,10 +142,10 @@ class Stream(Closing):
         tracks = tracks.of(tracks.invertible & (tracked.texture >= BLANK_TEXTURE))  # a blank image's tracks are noise
         with self.seconds.of("mapping"):
             if self._imu is not None:
-                keyframe |= self._imu.wants_keyframe(mapper, frame.index, frame.timestamp)
+                keyframe |= self._imu.wants_keyframe(mapper, time)
             image = mapper.add(tracks, lambda: self._read_depth(frame, tracks.pixels), keyframe=keyframe)
             if self._imu is not None:
-                self._imu.follow(mapper, frame.timestamp)
+                self._imu.follow(mapper, time)
         focal_changed |= self._follow_focal(mapper)
         self.frames.append(SeenFrame(frame.index, frame.name, frame.timestamp, tracked.texture))
         self._thumbnails.add(frame.image)
@@ -175,7 +175,11 @@ class Stream(Closing):
         (`world_from_cam`) of the frame with index i, where that is a keyframe (`keyframes`); ``L(j)`` the landmark of
         track j; ``A(i)`` scale and shift of the depth map of frame i (`graph.factors.affine_of_native`); ``K(0)`` the
         lens where it is not known. An index that came twice counts on from the largest one.
+
+        Raises:
+            InputError: the stream is closed, as by `finish`.
         """
+        self._check_open("has no graph any more")
         return self._mapper.graph() if self._mapper is not None else empty_graph()
 
     def add_factors(self, graph: Factors, values: Values) -> None:
@@ -192,9 +196,10 @@ class Stream(Closing):
 
         Raises:
             InputError: a factor cannot be taken (Python callback, unknown key, key that is in use, variables that are
-                left open), or the stream has control or no map yet. Where the images contradict the factors only the
-                update finds out: `FrameUpdate.note` then says that they are refused.
+                left open), or the stream is closed, has control or no map yet. Where the images contradict the factors
+                only the update finds out: `FrameUpdate.note` then says that they are refused.
         """
+        self._check_open("takes no factors")
         if self.control is not None:
             raise InputError("a stream with control takes no factors; say of the control what the factors would")
         if self._mapper is None or not self._mapper.started:
@@ -269,10 +274,10 @@ class Stream(Closing):
         """Go on where a stream was saved; the next frame to push is number `len(stream.frames)`.
 
         Args:
-            path: of the snapshot; depth, masks, imu: what the stream had.
+            path: of the snapshot; depth, masks, imu: the priors and the recording that the stream had.
 
         Raises:
-            InputError: the file cannot be read, is torn, or is no snapshot.
+            InputError: the file cannot be read, is torn, or is no snapshot; the stream had an IMU and none is given.
         """
         state = read_snapshot(Path(path))
         try:
@@ -298,8 +303,10 @@ class Stream(Closing):
             self._mapper = self._new_mapper()
             self._mapper.restore(state["mapper"])
             self._indices = FrameIndices(image.tracks.frame for image in self._mapper.images)
-        if (imu := state["imu"]) is not None and self._imu is not None:
-            self._imu.restore(imu)
+        if state["imu"] is not None:
+            if self._imu is None:
+                raise InputError("the snapshot is of a stream with an IMU; its recording must be given, too")
+            self._imu.restore(state["imu"])
 
     def finish(self, progress: Progress | None = None) -> Reconstruction:
         """Polish over all frames and tracks.
@@ -346,6 +353,10 @@ class Stream(Closing):
         """End all threads and processes of the stream, with a result or without; `finish` closes, too."""
         self._closed = True
         self._held.close()
+
+    def _check_open(self, what: str) -> None:
+        if self._closed:
+            raise InputError(f"the stream is closed and {what}")
 
     def _open(self, frame: Frame) -> Mapper:
         """Everything that waits for the size of the first frame."""

@@ -98,7 +98,28 @@ REFUSED = {
         values_of(p0=gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, 1.0]))), "indeterminate: the factors do not determi",
     ),
     "nan": (
-        graph_of(gtsam.PriorFactorPose3(X(0), gtsam.Pose3(gtsam.Rot3(), np.full(3, np.nan)), NOISE)), None, "not fini",
+        graph_of(gtsam.PriorFactorPose3(X(0), gtsam.Pose3(gtsam.Rot3(), np.full(3, np.nan)), NOISE)), None,
+        "factor 0, a PriorFactorPose3, holds a number that is not finite",
+    ),
+    "overflow": (
+        graph_of(gtsam.GPSFactor(X(0), np.full(3, 1e300), UNIT_3)), None,
+        "factor 0, a GPSFactor, is not finite at the given values",
+    ),
+    "infinity": (
+        graph_of(gtsam.GPSFactor(X(0), np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, np.inf))), None,
+        "factor 0, a GPSFactor, holds a number that is not finite",
+    ),
+    "another type": (
+        graph_of(gtsam.PriorFactorPoint3(X(0), np.zeros(3), UNIT_3)), None,
+        'factor 0, a PriorFactorPoint3, cannot be evaluated: .* key "x0", type stored in Values is .*Pose3',
+    ),
+    "own of another type": (
+        graph_of(gtsam.PriorFactorPose3(P(0), gtsam.Pose3(), NOISE)), values_of(p0=np.zeros(3)),
+        'factor 0, a PriorFactorPose3, cannot be evaluated: .* key "p0"',
+    ),
+    "constraint": (
+        graph_of(gtsam.BetweenFactorPose3(X(0), X(1), gtsam.Pose3(), gtsam.noiseModel.Constrained.All(6))), None,
+        "factor 0, a BetweenFactorPose3, has a standard deviation of zero; a small one is expected",
     ),
 }  # fmt: skip
 
@@ -193,6 +214,21 @@ def test_the_unit_of_length_is_that_of_the_factors(unit):
     assert found == pytest.approx(unit, rel=1e-6)
     steps = np.linalg.norm([truth.poses[k].between(truth.poses[k + 1]).translation() for k in range(5)], axis=1)
     assert std == pytest.approx(0.01 * unit / np.sqrt((steps**2).sum()), rel=1e-3)
+
+
+def test_positions_in_another_world_determine_no_unit():
+    """As fixes are, whose axes are not those of the first camera; noise makes a unit as uncertain as it is large."""
+    truth, sigma = Contents(5.0), gtsam.noiseModel.Isotropic.Sigma(3, 0.01)
+    world = gtsam.Pose3(gtsam.Rot3.Ypr(0.3, 0.2, 1.0), np.array([412.0, -77.0, 30.0]))
+    fixes = [world.compose(pose).translation() for pose in truth.poses]
+    graph = graph_of(*(gtsam.GPSFactor(X(k), fix, sigma) for k, fix in enumerate(fixes)))
+    assert unit_of_length(AddedFactors.of(range(FRAMES), graph, gtsam.Values()), Contents()) == (1.0, np.inf)
+    noisy = [pose.translation() + 0.1 * (-1.0) ** k for k, pose in enumerate(truth.poses)]
+    graph = graph_of(*(gtsam.GPSFactor(X(k), place, sigma) for k, place in enumerate(noisy)))
+    found, std = unit_of_length(AddedFactors.of(range(FRAMES), graph, gtsam.Values()), Contents())
+    size = np.linalg.norm([pose.translation() for pose in truth.poses])
+    assert found == pytest.approx(5.0, abs=15 * std)
+    assert std == pytest.approx(0.1 / size, rel=0.2)
 
 
 def test_variables_of_the_caller_follow_the_unit():

@@ -36,6 +36,7 @@ def test_a_resting_imu_is_accepted():
         ({"accelerometer": REST[1] / GRAVITY}, "the median of the accelerometer's magnitude is 1 m/s"),
         ({"accelerometer": np.zeros((100, 3))}, "the median of the accelerometer's magnitude is 0 m/s"),
         ({"time_offset": np.inf}, "the time offset of the IMU is inf; seconds are expected"),
+        ({"lever_arm": [20.0, 0.0, 15.0]}, "the IMU is 25 m from the camera; at most 10 is expected"),
         ({"cam_from_imu": np.diag([1.0, 1.0, -1.0])}, "which is no rotation matrix"),
         ({"time": [0.0], "gyroscope": REST[0][:1], "accelerometer": REST[1][:1]}, "has 1 samples; at least 2"),
     ],

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import L, P, X
 
-from factorsfm import Control, Frame, InputError, KnownDistance, Stream
+from factorsfm import Control, Frame, InputError, KnownDistance, Stream, read_result
 from factorsfm.support.similarity import pose_arrays
 from factorsfm.synthetic import RenderedShot, render_shot
 from tests.rendered import Maps, rendered, simulated_maps
@@ -231,6 +231,27 @@ def test_factors_after_the_last_keyframe_are_heard_by_the_polish(stream):
     centers = result.camera_centers()
     true = metric(shot, 0).between(metric(shot, 7)).translation()
     assert np.linalg.norm(centers[-1] - centers[0]) == pytest.approx(np.linalg.norm(true), rel=3e-3)
+
+
+@pytest.mark.parametrize("length", [None, 0.0])
+def test_what_tells_no_length_leaves_the_unit_open(stream, length, tmp_path):
+    """A rotation; a range of zero between cameras that move, to which no unit leads."""
+    shot = rendered("truck")
+    for image in shot.images:
+        stream.push(image, keyframe=True)
+    stream.trajectory()
+    loose = gtsam.noiseModel.Diagonal.Sigmas(np.array([1e-3] * 3 + [1e6] * 3))
+    graph = gtsam.NonlinearFactorGraph()
+    graph.add(gtsam.BetweenFactorPose3(X(1), X(4), metric(shot, 1).between(metric(shot, 4)), loose))
+    if length is not None:
+        graph.add(gtsam.RangeFactorPose3(X(0), X(4), length, gtsam.noiseModel.Isotropic.Sigma(1, 1e-3)))
+    stream.add_factors(graph, gtsam.Values())
+    result = stream.finish()
+    assert not result.metric
+    assert result.control.scale_std == np.inf
+    assert any(note.endswith("; they leave the unit of length open.") for note in result.notes)
+    result.write(tmp_path / "out")
+    assert not np.isfinite(read_result(tmp_path / "out").control.scale_std)
 
 
 def test_variables_are_named_by_the_index_of_the_frame():

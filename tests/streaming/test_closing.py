@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import gtsam
 import numpy as np
 import pytest
 
@@ -88,6 +89,10 @@ def test_a_closed_stream_takes_no_frame_and_keeps_what_it_knows() -> None:
     s.close()
     with pytest.raises(InputError, match="the stream is closed and takes no further frame"):
         s.push(rendered("dolly").images[0])
+    with pytest.raises(InputError, match="the stream is closed and has no graph any more"):
+        s.graph()
+    with pytest.raises(InputError, match="the stream is closed and takes no factors"):
+        s.add_factors(gtsam.NonlinearFactorGraph(), gtsam.Values())
     assert len(s.frames) == FRAMES
     assert all(pose is not None for pose in s.trajectory())
 

@@ -1,8 +1,10 @@
 """An IMU beside a stream: metric scale, up, poses of frames that show nothing; and recordings that do not fit."""
 
+import itertools
 import json
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,10 +18,15 @@ from factorsfm import (
     InputError,
     KnownDistance,
     Reconstruction,
+    ReconstructionError,
     Stream,
     read_result,
     reconstruct,
 )
+from factorsfm.inertial.fit import ImuFit
+from factorsfm.streaming import imu_source
+from factorsfm.streaming.imu_result import _note
+from factorsfm.streaming.imu_source import ImuSource
 from factorsfm.support.rotations import exponential
 from factorsfm.support.similarity import pose_arrays
 from factorsfm.synthetic import handheld_path, simulate_imu
@@ -127,23 +134,45 @@ def test_frames_that_show_nothing_get_the_pose_of_the_imu(tmp_path):
 
 
 @pytest.mark.slow
-def test_it_goes_on_after_a_snapshot(tmp_path):
-    imu, every = unknown(recording()), list(frames())
+def test_a_recording_that_starts_late_and_a_snapshot(tmp_path):
+    whole = recording()
+    part = whole.time > 1.2
+    imu = unknown(replace(
+        whole, time=whole.time[part], gyroscope=whole.gyroscope[part], accelerometer=whole.accelerometer[part],
+    ))  # fmt: skip
     with Stream(CAMERA, imu=imu) as stream:
-        for frame in every[:70]:
+        for frame in itertools.islice(frames(), 100):
             stream.push(frame)
         assert stream._imu.takes_part
         stream.save(tmp_path / "snapshot")
+    with pytest.raises(InputError, match="the snapshot is of a stream with an IMU; its recording must be given, too"):
+        Stream.load(tmp_path / "snapshot")
     with Stream.load(tmp_path / "snapshot", imu=imu) as stream:
-        for frame in every[70:]:
+        assert stream._imu.takes_part
+        for frame in itertools.islice(frames(), 100, None):
             stream.push(frame)
         result = stream.finish()
-    assert result.imu is not None
-    centers = pose_arrays([frame.cam_from_world for frame in result.frames])[1]
-    true = truth()[1]
-    ratio = np.linalg.norm(centers - centers[0], axis=1).sum() / np.linalg.norm(true - true[0], axis=1).sum()
-    assert ratio == pytest.approx(1.0, abs=0.015)
-    assert len([r for r in result.control.residuals if r.name.startswith("CombinedImuFactor")]) > 10
+    assert result.metric
+    assert 0.004 < result.imu.scale_std < 0.012
+    assert result.imu.time_offset == pytest.approx(OFFSET, abs=1e-3)
+    centers = result.camera_centers()
+    length, true = (np.linalg.norm(c[-1] - c[0]) for c in (centers, truth()[1]))
+    assert length == pytest.approx(true, rel=3 * result.imu.scale_std)
+
+
+@pytest.mark.parametrize(
+    ("offset", "said"),
+    [
+        (0.317, "its clock is 317.0 ± 0.2 ms behind the video's"),
+        (-1.7e9, "its clock is 1700000000.0000 ± 0.0002 s ahead of the video's"),
+    ],
+)
+def test_clocks_are_told_in_a_fitting_unit(offset, said):
+    fit = ImuFit(
+        up=[0, -1, 0], up_std=0.1, scale_std=0.006, cam_from_imu=np.eye(3).tolist(), rotation_std=0.1,
+        time_offset=offset, time_offset_std=2e-4, gyroscope_bias=[0, 0, 0], accelerometer_bias=[0, 0, 0], frames=0,
+    )  # fmt: skip
+    assert said in _note(fit)
 
 
 @pytest.mark.slow
@@ -161,6 +190,15 @@ def test_frames_without_times_and_sets_are_refused():
     imu = recording()
     with Stream(CAMERA, imu=imu) as stream, pytest.raises(InputError, match="frame 0 has no time; an IMU needs those"):
         stream.push(images()[0])
+    with Stream(CAMERA, imu=imu) as stream:
+        stream.push(Frame(0, images()[0], "0", timestamp=0.0))
+        for none in (None, float("nan")):
+            with pytest.raises(InputError, match="frame 1 has no time"):
+                stream.push(Frame(1, images()[1], "1", timestamp=none))
+        stream.push(Frame(1, images()[1], "1", timestamp=1 / FPS))
+        assert [image.tracks.frame for image in stream._mapper.images] == [0, 1]  # as if they had not come
+    with pytest.raises(InputError, match="the IMU is of type str; the ImuRecording of open_imu is expected"):
+        Stream(CAMERA, imu="imu.csv")
     with pytest.raises(InputError, match="an IMU goes with a video"):
         reconstruct(frames(), camera=CAMERA, depth=None, imu=imu, unordered=True)
     control = Control(distances=[KnownDistance(length=1.0, sigma=0.1, frames=(0, 5))])
@@ -176,3 +214,25 @@ def test_a_camera_that_does_not_accelerate_shows_no_scale():
     result = reconstruct(shot, camera=CAMERA, depth=None, imu=still)
     assert not result.metric
     assert any(note.startswith("IMU: it takes no part: ") for note in result.notes)
+
+
+def test_attempts_that_fail_become_rarer(monkeypatch):
+    """Each takes all frames so far: every half second of ten minutes they would take longer than the video."""
+    attempts = []
+
+    def fails(recording, times, rotations):
+        attempts.append(len(times))
+        raise ReconstructionError("it does not fit")
+
+    monkeypatch.setattr(imu_source, "fit_timing", fails)
+    source, mapper = ImuSource(recording()), SimpleNamespace(starts_anew=False, keyframes=[], images=[])
+    times = []
+    for k in range(1200):
+        times.append(k / 2)
+        mapper.keyframes.append(k)
+        source.follow(mapper, times)
+    assert 40 < len(attempts) < 80
+    assert max(np.diff(attempts)) < 120
+    source.follow(mapper, times, finished=True)
+    assert attempts[-1] == len(times)
+    assert source.reason == "it does not fit"
