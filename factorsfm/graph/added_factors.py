@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 logger = logging.getLogger(__name__)
 
 HELD = 1e-6  # standard deviation of what is constant
+_GROSS = 30.0  # standard deviations, of a factor that is grossly off
 RESERVED = {
     "x": "a keyframe of the map", "l": "a landmark of the map", "a": "a keyframe with a depth map",
     "k": "a variable that takes added factors", "t": "a variable that takes added factors",
@@ -144,6 +145,24 @@ def present_values(keys: Iterable[int], present: MapValues) -> gtsam.Values:
         elif letter == "l" and (point := present.landmark(number)) is not None:
             values.insert(key, point)
     return values
+
+
+def error_of(factor: gtsam.NonlinearFactor, values: gtsam.Values) -> float:
+    """In standard deviations, the root mean square of its rows; of what was linearised, the root of their sum."""
+    # GTSAM crashes where a linearised factor that was read from text is asked for its rows.
+    rows = 1 if isinstance(factor, gtsam.LinearContainerFactor) else max(factor.dim(), 1)
+    return float(np.sqrt(2.0 * max(factor.error(values), 0.0) / rows))
+
+
+def misfit_of(added: AddedFactors, estimate: gtsam.Values) -> str:
+    """Which factor is off by most, and by how many standard deviations; empty where none is grossly off."""
+    graph, worst, largest = added.graph(), "", _GROSS
+    for k in range(graph.size()):
+        factor, size = graph.at(k), error_of(graph.at(k), estimate)
+        if not size <= largest:
+            names = ", ".join(map(name_of, factor.keys()))
+            worst, largest = f"{type(factor).__name__} on {names} is off by {size:.0f} sigma", size
+    return worst
 
 
 def on_window(added: AddedFactors, window: Window, present: MapValues) -> tuple[AddedFactors, gtsam.Values]:

@@ -13,6 +13,7 @@ from factorsfm.graph.added_factors import (
     HELD,
     AddedFactors,
     MapValues,
+    error_of,
     held_prior,
     keys_of,
     name_of,
@@ -79,7 +80,7 @@ class FactorsOnPoses:
         return [
             (
                 f"{type(factor).__name__} on {', '.join(map(name_of, factor.keys()))}",
-                float(np.sqrt(2.0 * max(factor.error(values), 0.0) / factor.dim())),
+                error_of(factor, values),
             )
             for factor in factors
         ]

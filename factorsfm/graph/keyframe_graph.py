@@ -15,7 +15,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.graph.added_factors import NOTHING_ADDED, AddedFactors
+from factorsfm.graph.added_factors import NOTHING_ADDED, AddedFactors, misfit_of
 from factorsfm.graph.live_isam import LiveIsam
 from factorsfm.graph.window import Window
 
@@ -39,6 +39,7 @@ class UpdateResult:
         covariance: (6, 6) of each pose that is solved for, by keyframe (`FrameResult.covariance`).
         mirrored: whether it was rolled back because the solution and the prior are each other's mirror image.
         added: the caller's factors, with the values of their variables after the update.
+        misfit: which of them is grossly off all the same, and by how much; empty if none is.
     """
 
     committed: bool
@@ -47,6 +48,7 @@ class UpdateResult:
     covariance: dict[int, Array] = field(default_factory=dict)
     mirrored: bool = False
     added: AddedFactors = NOTHING_ADDED
+    misfit: str = ""
 
 
 class KeyframeGraph:
@@ -85,8 +87,10 @@ class KeyframeGraph:
                 if not reason:
                     self._live, solved = _with_open_lens(live, solved)
                     covariance = self._live.covariances(solved)
-                    added = added.with_values(self._live.estimate())
-                    return UpdateResult(True, "committed", solved, covariance, added=added)
+                    estimate = self._live.estimate()
+                    misfit = misfit_of(added, estimate)
+                    added = added.with_values(estimate)
+                    return UpdateResult(True, "committed", solved, covariance, added=added, misfit=misfit)
                 break
             except Exception as error:  # gtsam raises several types; any of them leaves the trial unusable
                 reason = f"the linear system of the update is indeterminate ({_first_line(error)})"

@@ -69,9 +69,14 @@ class Additions:
             logger.warning(update.refused)
             return update.refused
         self.taken += offered
-        if update.unit == 1.0:
-            return ""
-        return f"the factors added set the unit of length: lengths are now {update.unit:.4g} times as long"
+        said = []
+        if update.unit != 1.0:
+            said.append(f"the factors added set the unit of length: lengths are now {update.unit:.4g} times as long")
+        if offered and update.misfit:
+            where = "factors are in the world of the first keyframe"
+            said.append(f"of the factors added, {update.misfit} after the update; {where}")
+            logger.warning(said[-1])
+        return "; ".join(said)
 
 
 def _joined(batches: Sequence[AddedFactors]) -> AddedFactors:

@@ -33,7 +33,7 @@ class MapUpdate:
         mirrored: see `UpdateResult`.
         unit: how many times as long lengths are now, all others of the map included.
         added: the caller's factors as the next update needs them; offered: how many of those that waited were tried;
-            refused: why these were not taken.
+            refused: why these were not taken; misfit: which of them is grossly off all the same.
         no_prior: whether the keyframes show that the depth prior is none; `reason` says why.
     """
 
@@ -55,6 +55,7 @@ class MapUpdate:
     added: AddedFactors | None = None
     offered: int = 0
     refused: str = ""
+    misfit: str = ""
 
 
 @dataclass(frozen=True, slots=True)

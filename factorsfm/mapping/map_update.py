@@ -206,7 +206,7 @@ def judged(copy: MapCopy, images: list[MappedImage], result: UpdateResult) -> Ma
     return MapUpdate(
         images[-1].tracks.position, images[-1].tracks.depth, True, result.reason,
         window.ids[good], window.points[good], window.ids[~good], poses, affines, covariances,
-        window.focal if window.focal != copy.focal else None, added=result.added,
+        window.focal if window.focal != copy.focal else None, added=result.added, misfit=result.misfit,
     )  # fmt: skip
 
 

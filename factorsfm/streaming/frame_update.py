@@ -10,6 +10,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from factorsfm.frames.frame import Frame
+from factorsfm.frames.texture import BLANK_TEXTURE
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.mapping.mapper import Mapper
 from factorsfm.result.reconstruction import FrameResult
@@ -100,6 +101,19 @@ def frame_update(
         frame.dropped, focal_length=mapper.focal, focal_changed=focal_changed, starts_anew=mapper.starts_anew,
         note=mapper.note,
     )  # fmt: skip
+
+
+def keyframe_times(images: Sequence[MappedImage], frames: Sequence[SeenFrame]) -> dict[int, float | None]:
+    """Timestamps of the keyframes, by the index that names them."""
+    pairs = zip(images, frames, strict=True)
+    return {image.tracks.frame: frame.timestamp for image, frame in pairs if image.keyframe}
+
+
+def mark_blank(mapper: Mapper, position: int, texture: float) -> None:
+    """Where an image without texture is not registered, that is the reason to give."""
+    if texture < BLANK_TEXTURE:
+        contrast = f"contrast {texture:.2f} of {BLANK_TEXTURE:.2f} needed grey levels"
+        mapper.explain(position, FrameStatus.BLANK, contrast)
 
 
 def frame_results(frames: Sequence[SeenFrame], images: Sequence[MappedImage]) -> list[FrameResult]:

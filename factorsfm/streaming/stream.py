@@ -31,7 +31,16 @@ from factorsfm.priors.read_priors import read_depth, read_mask
 from factorsfm.report.thumbnails import Thumbnails
 from factorsfm.result.reconstruction import Reconstruction
 from factorsfm.streaming.finishing import EndedShot
-from factorsfm.streaming.frame_update import FrameIndices, FrameUpdate, SeenFrame, frame_results, frame_update, pose_of
+from factorsfm.streaming.frame_update import (
+    FrameIndices,
+    FrameUpdate,
+    SeenFrame,
+    frame_results,
+    frame_update,
+    keyframe_times,
+    mark_blank,
+    pose_of,
+)
 from factorsfm.streaming.imu_source import ImuSource
 from factorsfm.streaming.snapshot import read_snapshot, write_snapshot
 from factorsfm.streaming.view_finder import ViewFinder
@@ -155,7 +164,7 @@ class Stream(Closing):
         with self.seconds.of("relocalization"):
             self._finder.keep_in_sight(mapper, image, grey)
         if image.status is not FrameStatus.WAITING:  # it may still take part in the start
-            _mark_blank(mapper, len(self.frames) - 1, tracked.texture)
+            mark_blank(mapper, len(self.frames) - 1, tracked.texture)
         return frame_update(frame, image, mapper, self.frames, focal_changed=focal_changed)
 
     def trajectory(self) -> list[pycolmap.Rigid3d | None]:
@@ -185,18 +194,16 @@ class Stream(Closing):
     def add_factors(self, graph: Factors, values: Values) -> None:
         """Add factors of your own to the live graph; the update of the next keyframe takes all of them, or none.
 
-        Factors name the poses ``X(i)`` and affines ``A(i)`` of `keyframes`, landmarks ``L(j)`` of the map, and
-        variables of your own with any other letter. They are in the world of the stream: that of its first keyframe,
-        whose pose stays. Where they determine the unit of length, all lengths follow (`FrameUpdate.note` says so), and
-        the result is in that unit, too. They take part in `finish`, and go with `save`.
+        They name poses ``X(i)`` and affines ``A(i)`` of `keyframes`, landmarks ``L(j)``, and variables of your own with
+        any other letter, in the world of the first keyframe, whose pose stays. Where they determine the unit of length,
+        all lengths follow (`FrameUpdate.note` says so). They take part in `finish`, and go with `save`.
 
         Args:
-            graph: GTSAM's factors in C++, which can be serialised.
-            values: of the variables of your own that no earlier factor has named.
+            graph: GTSAM's factors in C++, which can be serialised; values: of variables that no earlier factor named.
 
         Raises:
             InputError: a factor cannot be taken (Python callback, unknown key, key that is in use, variables that are
-                left open), or the stream is closed, has control or no map yet. Where the images contradict the factors
+                left open), or the stream is closed, has control or no map yet. That the images contradict the factors
                 only the update finds out: `FrameUpdate.note` then says that they are refused.
         """
         self._check_open("takes no factors")
@@ -209,12 +216,7 @@ class Stream(Closing):
     @property
     def keyframes(self) -> dict[int, float | None]:
         """Timestamps (seconds, None if unknown) of the keyframes of the map, by the index i of ``X(i)``."""
-        images = self._mapper.images if self._mapper is not None else []
-        return {
-            image.tracks.frame: frame.timestamp
-            for image, frame in zip(images, self.frames, strict=True)
-            if image.keyframe
-        }
+        return keyframe_times(self._mapper.images, self.frames) if self._mapper is not None else {}
 
     @property
     def points(self) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
@@ -333,7 +335,7 @@ class Stream(Closing):
             self._mapper.finish(self._imu.finish if self._imu is not None else lambda mapper: None)
         self._follow_focal(self._mapper)
         for position, seen in enumerate(self.frames):
-            _mark_blank(self._mapper, position, seen.texture)
+            mark_blank(self._mapper, position, seen.texture)
         assert self.camera is not None
         return EndedShot(
             frames=self.frames,
@@ -402,10 +404,3 @@ class Stream(Closing):
                 logger.warning("%s; the frame goes without", error)
                 self._without_depth[frame.index] = str(error)
                 return None
-
-
-def _mark_blank(mapper: Mapper, position: int, texture: float) -> None:
-    """Where an image without texture is not registered, that is the reason to give."""
-    if texture < BLANK_TEXTURE:
-        contrast = f"contrast {texture:.2f} of {BLANK_TEXTURE:.2f} needed grey levels"
-        mapper.explain(position, FrameStatus.BLANK, contrast)

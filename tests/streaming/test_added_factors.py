@@ -204,6 +204,44 @@ def test_what_contradicts_the_images_is_refused_as_a_whole_and_said(stream):
     assert stream.finish().control is None
 
 
+def test_a_linearised_factor_of_another_solution_is_heard(stream):
+    """As `condensed_factor` makes them; GTSAM cannot say how many rows such a factor has once it was text."""
+    shot = rendered("truck")
+    for image in shot.images[:5]:
+        stream.push(image, keyframe=True)
+    known, values = odometry(shot, [0, 2, 4]), gtsam.Values()
+    for i in (0, 2, 4):
+        values.insert(X(i), metric(shot, 0).between(metric(shot, i)))
+    linear = gtsam.NonlinearFactorGraph()
+    for k in range(known.size()):
+        linear.add(gtsam.LinearContainerFactor(known.at(k).linearize(values), values))
+    stream.add_factors(linear, gtsam.Values())
+    for image in shot.images[5:]:
+        stream.push(image, keyframe=True)
+    result = stream.finish()
+    assert result.metric
+    assert [r.name for r in result.control.residuals] == [f"LinearContainerFactor on x{i}, x{i + 2}" for i in (0, 2)]
+    length = np.linalg.norm(result.camera_centers()[4] - result.camera_centers()[0])
+    true = np.linalg.norm(metric(shot, 0).between(metric(shot, 4)).translation())
+    assert length == pytest.approx(true, rel=0.02)
+
+
+def test_fixes_in_another_world_are_told(stream):
+    shot = rendered("truck")
+    for image in shot.images[:5]:
+        stream.push(image, keyframe=True)
+    stream.trajectory()
+    fixes = gtsam.NonlinearFactorGraph()
+    for i in stream.keyframes:
+        place = np.array([4000.0, 3000.0, 20.0]) + metric(shot, i).translation()
+        fixes.add(gtsam.GPSFactor(X(i), place, gtsam.noiseModel.Isotropic.Sigma(3, 0.1)))
+    stream.add_factors(fixes, gtsam.Values())
+    notes = [stream.push(image, keyframe=True).note for image in shot.images[5:]]
+    assert any("GPSFactor on x0 is off by " in note and "world of the first keyframe" in note for note in notes) or any(
+        "are refused" in note for note in notes
+    ), notes
+
+
 def test_what_cannot_be_taken_is_said_at_once(stream):
     shot, nothing = rendered("truck"), gtsam.Values()
     with pytest.raises(InputError, match="there is no map yet"):

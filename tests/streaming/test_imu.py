@@ -226,13 +226,12 @@ def test_attempts_that_fail_become_rarer(monkeypatch):
 
     monkeypatch.setattr(imu_source, "fit_timing", fails)
     source, mapper = ImuSource(recording()), SimpleNamespace(starts_anew=False, keyframes=[], images=[])
-    times = []
+    mapper.started = True
     for k in range(1200):
-        times.append(k / 2)
         mapper.keyframes.append(k)
-        source.follow(mapper, times)
+        source.follow(mapper, k / 2)
     assert 40 < len(attempts) < 80
     assert max(np.diff(attempts)) < 120
-    source.follow(mapper, times, finished=True)
-    assert attempts[-1] == len(times)
+    source.finish(mapper)
+    assert attempts[-1] == 1200
     assert source.reason == "it does not fit"
