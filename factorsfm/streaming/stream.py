@@ -35,6 +35,7 @@ from factorsfm.streaming.frame_update import (
     FrameIndices,
     FrameUpdate,
     SeenFrame,
+    check_size,
     frame_results,
     frame_update,
     keyframe_times,
@@ -58,7 +59,6 @@ from factorsfm.tracks.image_tracks import ImageTracks
 logger = logging.getLogger(__name__)
 
 _STATE = ("camera", "_size", "_lens_given", "_without_depth")
-_LEAST_SIDE = 32  # pixels: room for the patches of the tracker
 
 
 class Stream(Closing):
@@ -131,11 +131,7 @@ class Stream(Closing):
         time = self._imu.check_time(frame.index, frame.timestamp) if self._imu is not None else 0.0
         mapper = self._mapper or self._open(frame)
         focal_changed = self._follow_focal(mapper)
-        if frame.image.shape[1::-1] != self._size:
-            raise InputError(
-                f"frame {frame.index} is {frame.image.shape[1]}x{frame.image.shape[0]}, "
-                f"expected {self._size[0]}x{self._size[1]} as the frames before"
-            )
+        check_size(frame, self._size)
         with self.seconds.of("masks"):
             mask = read_mask(self._masks, frame)
         with self.seconds.of("tracking"):
@@ -168,7 +164,7 @@ class Stream(Closing):
         return frame_update(frame, image, mapper, self.frames, focal_changed=focal_changed)
 
     def trajectory(self) -> list[pycolmap.Rigid3d | None]:
-        """`cam_from_world` of every frame so far as the graph knows it now, None where a frame is not registered.
+        """`cam_from_world` of every frame so far as the graph knows it now, None where it has none.
 
         The map takes over what the graph is working on, and the frames between keyframes are registered on it again.
         """
@@ -362,9 +358,8 @@ class Stream(Closing):
 
     def _open(self, frame: Frame) -> Mapper:
         """Everything that waits for the size of the first frame."""
+        check_size(frame, None)
         height, width = frame.image.shape[:2]
-        if min(height, width) < _LEAST_SIDE:
-            raise InputError(f"the images have {width}x{height} pixels; at least {_LEAST_SIDE} on each side are needed")
         if self.camera is None:
             self.camera = guess_camera(width, height, frame.path)
             self.options = self.options.for_unknown_lens()
