@@ -25,6 +25,7 @@ _DOUBTFUL_INFLATION = 8.0  # see `error_inflation`; right solutions have 1 to 6,
 _CLEARLY = 0.9  # of the cost of the solution from the incremental map, below which another one is preferred
 _SETTLED = 0.8  # of the assumed noise, below which the measured noise asks for another round
 _ROUNDS = 3  # in which what moves is left out
+_POINT_ITERATIONS = 4  # of the points alone, until they show what fits the cameras of a start
 _CORE_TRACKS = 400  # on which the cameras are solved first
 _CELLS, _CELL_TRACKS = (8, 5), 10  # across and down, and the tracks of each with which an unknown lens is estimated
 
@@ -62,12 +63,25 @@ def best_solution(start: State, few: Observations, options: Options) -> CameraSo
     best = found.adjustment
     if best.sigma > options.polish.doubtful_px or best.error_inflation() > _DOUBTFUL_INFLATION:
         logger.info("the solution does not fit (%.2f px), trying other starts", best.sigma)
-        flat = solution_from(_flat(start, few, options.polish), few, options)
-        found = _better(found, _without_moving(flat, options), few)
+        for other in (start, _flat(start, few, options.polish)):
+            found = _better(found, _on_what_fits(other, few, options), few)
         best = found.adjustment
         mirrored = solution_from(_reversed(best.state), best.observations, options)
         found = _better(found, replace(found, adjustment=mirrored), few)
     return replace(found, kept=kept[found.kept])
+
+
+def _on_what_fits(start: State, few: Observations, options: Options) -> CameraSolution:
+    """Converged from a start on the points that its cameras explain: what does not fit might lead away from it."""
+    points = BundleAdjustment(
+        start, few, replace(options.polish, iterations=_POINT_ITERATIONS), ErrorModel(1.0), free=Free(cameras=False)
+    )
+    points.solve()
+    sigma = coordinate_sigma(points.reprojection_errors())
+    moves = standing_out(BundleAdjustment(points.state, few, options.polish, ErrorModel(sigma)))
+    others = np.nonzero(~moves)[0]
+    found = _without_moving(solution_from(start.of(others), few.of(others), options), options)
+    return replace(found, kept=others[found.kept], moving=found.moving + int(moves.sum()))
 
 
 def _without_moving(solved: BundleAdjustment, options: Options) -> CameraSolution:

@@ -69,6 +69,19 @@ def test_a_map_that_went_with_the_walker_is_given_up(parallax):
     assert 1e-5 < path_error(found.adjustment, problem, scene) < 0.002
 
 
+@pytest.mark.parametrize(("parallax", "count"), [(0.02, 70), (0.05, 90), (0.1, 70)])
+def test_a_good_map_is_not_led_away_by_many_tracks(parallax, count):
+    # Nearly half of the tracks are the walker's: solved with all of them, the cameras go with it, and nothing of it
+    # stands out any more.
+    problem, scene, _ = with_walker(parallax, count)
+    start = perturbed(problem.truth, angle_rad=1e-4, shift=1e-3, structure=0.02)
+    found = best_solution(start, problem.observations, Options())
+    np.testing.assert_array_equal(found.kept, np.arange(scene))
+    assert found.moving == count
+    error_px = problem.focal * angles_between(found.adjustment.state.rotation, problem.truth.rotation)
+    assert 0.01 < error_px.max() < 0.3
+
+
 def test_tracks_that_slide_are_kept():
     # They stand out one by one, but nothing fits better without them.
     problem = make_problem("handheld", frames=16, points=160, parallax=0.05, noise_px=0.1)
