@@ -50,14 +50,17 @@ def resting(observations: Observations) -> NDArray[np.bool_]:
     return np.asarray(found & (found.sum() >= least))
 
 
-def contradicts(together: BundleAdjustment, alone: BundleAdjustment, kept: NDArray[np.bool_]) -> bool:
-    """Whether what rests spoils the solution of the others.
+def contradicts(
+    together: BundleAdjustment, alone: BundleAdjustment, kept: NDArray[np.bool_], below: float = _CONTRADICTS
+) -> bool:
+    """Whether what is suspected spoils the solution of the others.
 
     Args:
         together: solved with all points; alone: with the `kept` ones only.
+        below: share of the cost of the others that they must have without it.
     """
     residual = alone.reprojection_vectors()
     sigma = coordinate_sigma(np.linalg.norm(residual, axis=1))
     spoilt = together.reprojection_vectors()[kept[together.observations.point]]
     cost, spoilt_cost = (float(cauchy(r / sigma, alone.options.kernel)[0].sum()) for r in (residual, spoilt))
-    return cost < _CONTRADICTS * spoilt_cost
+    return cost < below * spoilt_cost

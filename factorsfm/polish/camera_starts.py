@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import ErrorModel, Free
 from factorsfm.adjustment.state import State
 from factorsfm.motion.burn_ins import contradicts, resting
+from factorsfm.motion.moving import SPOILT, bounded_cost, standing_out
 from factorsfm.support.options import Options, PolishOptions
 
 Index = NDArray[np.int64]
@@ -23,12 +24,28 @@ logger = logging.getLogger(__name__)
 _DOUBTFUL_INFLATION = 8.0  # see `error_inflation`; right solutions have 1 to 6, wrong ones 13 to 80
 _CLEARLY = 0.9  # of the cost of the solution from the incremental map, below which another one is preferred
 _SETTLED = 0.8  # of the assumed noise, below which the measured noise asks for another round
+_ROUNDS = 3  # in which what moves is left out
+_POINT_ITERATIONS = 4  # of the points alone, until they show what fits the cameras of a start
 _CORE_TRACKS = 400  # on which the cameras are solved first
 _CELLS, _CELL_TRACKS = (8, 5), 10  # across and down, and the tracks of each with which an unknown lens is estimated
 
 
-def best_solution(start: State, few: Observations, options: Options) -> tuple[Index, BundleAdjustment]:
-    """All cameras on the core tracks: which points are kept, and the solution that fits best.
+@dataclass(frozen=True, slots=True)
+class CameraSolution:
+    """All cameras on the core tracks.
+
+    Attributes:
+        kept: which of the points it has; adjustment: converged over them; moving: how many are left out because they
+            move by themselves.
+    """
+
+    kept: Index
+    adjustment: BundleAdjustment
+    moving: int = 0
+
+
+def best_solution(start: State, few: Observations, options: Options) -> CameraSolution:
+    """The solution on the core tracks that fits best, without those that move by themselves or rest in the image.
 
     Large residuals, or residuals that neighbouring tracks and frames have in common, show that a solution is wrong: the
     incremental map may have been bent or depth-reversed beyond repair. Other starts are tried then. (The error of a
@@ -42,18 +59,55 @@ def best_solution(start: State, few: Observations, options: Options) -> tuple[In
         if contradicts(best, alone, ~static):
             logger.info("%d of %d points do not move in the image and are left out", static.sum(), len(static))
             kept, start, few, best = others, start.of(others), alone.observations, alone
+    found = _without_moving(best, options)
+    best = found.adjustment
     if best.sigma > options.polish.doubtful_px or best.error_inflation() > _DOUBTFUL_INFLATION:
         logger.info("the solution does not fit (%.2f px), trying other starts", best.sigma)
-        best = _better(best, solution_from(_flat(start, few, options.polish), few, options))
-        best = _better(best, solution_from(_reversed(best.state), few, options))
-    return kept, best
+        for other in (start, _flat(start, few, options.polish)):
+            found = _better(found, _on_what_fits(other, few, options), few)
+        best = found.adjustment
+        mirrored = solution_from(_reversed(best.state), best.observations, options)
+        found = _better(found, replace(found, adjustment=mirrored), few)
+    return replace(found, kept=kept[found.kept])
 
 
-def _better(known: BundleAdjustment, other: BundleAdjustment) -> BundleAdjustment:
-    """The other solution where it fits clearly better, judged with the same noise: a median alone may be chance."""
-    cost, other_cost = (
-        BundleAdjustment(b.state, b.observations, b.options, ErrorModel(known.sigma)).cost() for b in (known, other)
+def _on_what_fits(start: State, few: Observations, options: Options) -> CameraSolution:
+    """Converged from a start on the points that its cameras explain: what does not fit might lead away from it."""
+    points = BundleAdjustment(
+        start, few, replace(options.polish, iterations=_POINT_ITERATIONS), ErrorModel(1.0), free=Free(cameras=False)
     )
+    points.solve()
+    sigma = coordinate_sigma(points.reprojection_errors())
+    moves = standing_out(BundleAdjustment(points.state, few, options.polish, ErrorModel(sigma)))
+    others = np.nonzero(~moves)[0]
+    found = _without_moving(solution_from(start.of(others), few.of(others), options), options)
+    return replace(found, kept=others[found.kept], moving=found.moving + int(moves.sum()))
+
+
+def _without_moving(solved: BundleAdjustment, options: Options) -> CameraSolution:
+    """The solution without what moves by itself, as far as that spoils it."""
+    count = len(solved.state.bearing)
+    kept = np.arange(count)
+    for _ in range(_ROUNDS):
+        moves = standing_out(solved)
+        if not moves.any():
+            break
+        others = np.nonzero(~moves)[0]
+        alone = solution_from(solved.state.of(others), solved.observations.of(others), options)
+        if not contradicts(solved, alone, ~moves, SPOILT):
+            break
+        logger.info("%d of %d points move by themselves and are left out", moves.sum(), len(moves))
+        kept, solved = kept[others], alone
+    return CameraSolution(kept, solved, count - len(kept))
+
+
+def _better(known: CameraSolution, other: CameraSolution, few: Observations) -> CameraSolution:
+    """The other solution where it fits clearly better, judged with the same noise: a median alone may be chance.
+
+    With the smaller of both: to a solution that is wrong everywhere, what the right one leaves out is no worse.
+    """
+    sigma = min(known.adjustment.sigma, other.adjustment.sigma)
+    cost, other_cost = (bounded_cost(s.adjustment, sigma, len(few.frame)) for s in (known, other))
     return other if other_cost < _CLEARLY * cost else known
 
 

@@ -166,7 +166,7 @@ def _solved(
         frames, adjustment.state, start.tracks, start.observations, adjustment.reprojection_errors(), start.sigma,
         *adjustment.observation_sigmas(), start.motion, *_pose_covariances(covariance, adjustment.state),
         camera_observability(adjustment, marginals, covariance), marginals.inverse_distance_std(covariance),
-        left_out, prior, start.lens, start.shutter,
+        left_out, prior, start.lens, start.shutter, moving=start.moving,
     )  # fmt: skip
     result.describe_prior(adjustment, covariance)
     return adjustment, result

@@ -39,6 +39,7 @@ class Polished:
         shutter: a rolling shutter, None where the shot shows none; recorded: whether poses are those of cameras without
             one, fitted to the recorded images, see `Options.shutter`; rolled: (m, 2) where each observation is beside
             where such a camera would have it (pixels), None where they are not.
+        moving: share of the longest tracks that move by themselves and are left out.
         world_alignment: from this world to that of the control; control: its residuals. None without control.
         unused: "Control" or "Factors added", where there are some that could not take part.
     """
@@ -62,6 +63,7 @@ class Polished:
     shutter: Shutter | None = None
     recorded: bool = False
     rolled: Array | None = None
+    moving: float = 0.0
     world_alignment: Similarity | None = None
     control: ControlFit | None = None
     unused: str = ""

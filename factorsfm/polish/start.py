@@ -39,7 +39,7 @@ class PolishStart:
     Attributes:
         state: of cameras, lens and points; observations, tracks: that belong together.
         sigma: of the core tracks, pixels; inflation: of its square, since errors repeat themselves.
-        prior: with the weight it earns; lens, shutter: see `Polished`.
+        prior: with the weight it earns; lens, shutter, moving: see `Polished`.
     """
 
     state: State
@@ -51,6 +51,7 @@ class PolishStart:
     prior: WeighedPrior | None
     lens: LensEstimate | None
     shutter: Shutter | None
+    moving: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +60,7 @@ class _Core:
 
     Attributes:
         points: rows of the core among all points; adjustment: converged over them.
+        moving: see `Polished`.
     """
 
     points: Index
@@ -66,6 +68,7 @@ class _Core:
     motion: Motion
     lens: LensEstimate | None
     shutter: Shutter | None
+    moving: float
 
 
 def polish_start(
@@ -93,7 +96,7 @@ def polish_start(
 
     progress("polish: points")
     fitting = _with_fitting_tracks(part, core, observations, tracks, options.polish)
-    return PolishStart(*fitting, solved.sigma, inflation, motion, prior, core.lens, core.shutter)
+    return PolishStart(*fitting, solved.sigma, inflation, motion, prior, core.lens, core.shutter, core.moving)
 
 
 def _solved_core(shot: Shot, frames: list[int], observations: Observations, tracks: Index, options: Options) -> _Core:
@@ -101,8 +104,8 @@ def _solved_core(shot: Shot, frames: list[int], observations: Observations, trac
     o = options.polish
     core = core_tracks(observations, len(frames), everywhere=options.estimates_lens)
     few = observations.of(core)
-    kept, adjustment = best_solution(_first_guess(shot, frames, few, tracks[core], _world(observations)), few, options)
-    few = adjustment.observations
+    found = best_solution(_first_guess(shot, frames, few, tracks[core], _world(observations)), few, options)
+    adjustment, few = found.adjustment, found.adjustment.observations
     motion, lens, shutter = None, None, None
     if few.sweep is not None:
         motion = classify_motion(adjustment, o)
@@ -114,7 +117,7 @@ def _solved_core(shot: Shot, frames: list[int], observations: Observations, trac
         shutter = shutter and shutter.known_with(lens)
     if motion is None or lens is not None or shutter is not None:
         motion = classify_motion(adjustment, o)
-    return _Core(core[kept], adjustment, motion, lens, shutter)
+    return _Core(core[found.kept], adjustment, motion, lens, shutter, found.moving / len(core))
 
 
 def _first_guess(shot: Shot, frames: list[int], observations: Observations, tracks: Index, world: int) -> State:

@@ -33,6 +33,11 @@ def result_notes(
         depth_given: whether there is a depth prior; has_depth: whether a frame has a depth map.
     """
     notes = _motion_notes(polished, has_depth)
+    if polished.moving:
+        notes.append(
+            f"Something moves by itself: {100 * polished.moving:.0f} % of the longest tracks, which are left out. "
+            "Masks of it make the cameras better still."
+        )
     if polished.lens is not None:
         notes.append(lens_note(polished.lens))
     if polished.control is not None:

@@ -55,7 +55,8 @@ def test_nothing_rests_where_the_camera_does():
 def test_captions_do_not_bend_the_cameras(parallax):
     # With the captions, the best fit is 16 pixels off.
     problem, scene = captioned("handheld", parallax)
-    core, solved = best_solution(perturbed(problem.truth, structure=0.2), problem.observations, Options())
+    found = best_solution(perturbed(problem.truth, structure=0.2), problem.observations, Options())
+    core, solved = found.kept, found.adjustment
     np.testing.assert_array_equal(core, np.arange(scene))
     error_px = problem.focal * angles_between(solved.state.rotation, problem.truth.rotation)
     assert 0.01 < error_px.max() < 0.3
@@ -64,7 +65,8 @@ def test_captions_do_not_bend_the_cameras(parallax):
 @pytest.mark.parametrize(("motion", "parallax"), [("truck", 0.05), ("dolly", 0.1)])
 def test_what_may_be_far_away_is_kept(motion, parallax):
     problem, _ = captioned(motion, parallax)
-    core, solved = best_solution(perturbed(problem.truth, structure=0.2), problem.observations, Options())
+    found = best_solution(perturbed(problem.truth, structure=0.2), problem.observations, Options())
+    core, solved = found.kept, found.adjustment
     assert len(core) == len(problem.points)
     error_px = problem.focal * angles_between(solved.state.rotation, problem.truth.rotation)
     assert 0.01 < error_px.max() < 0.3

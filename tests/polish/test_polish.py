@@ -106,8 +106,8 @@ def test_a_solution_under_a_wide_kernel_is_solved_again():
     pixels = seen.pixels + wrong[:, None] * rng.normal(0.0, 5.0, seen.pixels.shape)
     seen = replace(seen, pixels=pixels)
     options = Options.preset_named("geometry")
-    _, best = best_solution(problem.truth, seen, options)
-    _, found = best_solution(bent(problem.truth), seen, options)
+    best = best_solution(problem.truth, seen, options).adjustment
+    found = best_solution(bent(problem.truth), seen, options).adjustment
     costs = [BundleAdjustment(b.state, seen, options.polish, ErrorModel(0.05)).cost() for b in (best, found)]
     assert costs[1] == pytest.approx(costs[0], rel=1e-4)
     assert found.sigma == pytest.approx(0.048, rel=0.05)

@@ -1,0 +1,118 @@
+"""What moves by itself: left out where it bends the cameras, and only there."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
+from factorsfm.adjustment.observations import Observations
+from factorsfm.adjustment.problem import ErrorModel
+from factorsfm.motion.moving import bounded_cost, standing_out
+from factorsfm.polish.camera_starts import best_solution
+from factorsfm.support.options import Options, PolishOptions
+from tests.estimation_problems import angles_between, centers, in_unit_of, make_problem, perturbed
+
+WALKER = 24
+
+
+def with_walker(parallax, count=WALKER):
+    """A problem whose last `count` points cross the image on a rigid body; how many are the scene's; the body's way."""
+    problem = make_problem("handheld", frames=16, points=160, parallax=parallax, noise_px=0.1)
+    truth, o, n, k = problem.truth, problem.observations, len(problem.points), problem.frames
+    rng = np.random.default_rng(0)
+    body = rng.uniform([-0.12, -0.2, 0.75], [0.0, 0.2, 0.85], (count, 3))
+    way = np.linspace(0.0, 1.0, k)[:, None] * [0.3, 0.02, 0.05]
+    seen = np.einsum("kij,nkj->nki", truth.rotation, body[:, None] + way) + truth.translation
+    xy = seen[..., :2] / seen[..., 2:] * problem.focal + problem.noise_px * rng.standard_normal((count, k, 2))
+    observations = Observations(
+        np.r_[o.frame, np.tile(np.arange(k), count)],
+        np.r_[o.point, np.repeat(n + np.arange(count), k)],
+        np.r_[o.pixels, xy.reshape(-1, 2)],
+    )
+    distance = np.linalg.norm(body, axis=1)
+    truth = replace(
+        truth,
+        bearing=np.r_[truth.bearing, body / distance[:, None]],
+        inverse_distance=np.r_[truth.inverse_distance, 1.0 / distance],
+    )
+    return replace(problem, truth=truth, points=np.r_[problem.points, body], observations=observations), n, way
+
+
+def path_error(solved, problem, scene):
+    """Largest distance of a camera from the truth, in units of the median distance of the scene."""
+    truth = problem.truth.of(np.arange(scene))
+    state = in_unit_of(solved.state, truth)
+    return np.linalg.norm(
+        centers(state.rotation, state.translation) - centers(truth.rotation, truth.translation), axis=1
+    ).max()
+
+
+@pytest.mark.parametrize("parallax", [0.05, 0.1])
+def test_a_walker_does_not_bend_the_cameras(parallax):
+    problem, scene, _ = with_walker(parallax)
+    found = best_solution(perturbed(problem.truth, structure=0.2), problem.observations, Options())
+    np.testing.assert_array_equal(found.kept, np.arange(scene))
+    assert found.moving == WALKER
+    error_px = problem.focal * angles_between(found.adjustment.state.rotation, problem.truth.rotation)
+    assert 0.01 < error_px.max() < 0.4
+    assert 1e-5 < path_error(found.adjustment, problem, scene) < 0.002
+
+
+@pytest.mark.parametrize("parallax", [0.02, 0.1])
+def test_a_map_that_went_with_the_walker_is_given_up(parallax):
+    # All that is seen fits such a path better than the right one, under a kernel that has no bound.
+    problem, scene, way = with_walker(parallax)
+    with_it = replace(problem.truth, translation=problem.truth.translation + way)
+    found = best_solution(with_it, problem.observations, Options())
+    np.testing.assert_array_equal(found.kept, np.arange(scene))
+    assert 1e-5 < path_error(found.adjustment, problem, scene) < 0.002
+
+
+@pytest.mark.parametrize(("parallax", "count"), [(0.02, 70), (0.05, 90), (0.1, 70)])
+def test_a_good_map_is_not_led_away_by_many_tracks(parallax, count):
+    # Nearly half of the tracks are the walker's: solved with all of them, the cameras go with it, and nothing of it
+    # stands out any more.
+    problem, scene, _ = with_walker(parallax, count)
+    start = perturbed(problem.truth, angle_rad=1e-4, shift=1e-3, structure=0.02)
+    found = best_solution(start, problem.observations, Options())
+    np.testing.assert_array_equal(found.kept, np.arange(scene))
+    assert found.moving == count
+    error_px = problem.focal * angles_between(found.adjustment.state.rotation, problem.truth.rotation)
+    assert 0.01 < error_px.max() < 0.3
+
+
+def test_tracks_that_slide_are_kept():
+    # They stand out one by one, but nothing fits better without them.
+    problem = make_problem("handheld", frames=16, points=160, parallax=0.05, noise_px=0.1)
+    o = problem.observations
+    slides = o.point % 8 == 0
+    rng = np.random.default_rng(1)
+    way = rng.normal(0.0, 4.0, (len(problem.points), 2))[o.point] * np.sin(0.5 * o.frame[:, None])
+    seen = replace(o, pixels=o.pixels + slides[:, None] * way)
+    found = best_solution(problem.truth, seen, Options())
+    assert standing_out(found.adjustment).sum() >= 8
+    assert (len(found.kept), found.moving) == (len(problem.points), 0)
+
+
+def test_few_points_do_no_harm():
+    problem, scene, _ = with_walker(0.05, count=7)
+    solved = BundleAdjustment(problem.truth, problem.observations, PolishOptions(), ErrorModel(0.1))
+    assert not standing_out(solved).any()
+    problem, scene, _ = with_walker(0.05, count=8)
+    solved = BundleAdjustment(problem.truth, problem.observations, PolishOptions(), ErrorModel(0.1))
+    np.testing.assert_array_equal(np.flatnonzero(standing_out(solved)), np.arange(scene, scene + 8))
+
+
+def test_what_is_left_out_costs_as_much_as_what_stands_out():
+    problem, scene, _ = with_walker(0.05)
+    o, every = problem.observations, len(problem.observations.frame)
+    whole = BundleAdjustment(problem.truth, o, PolishOptions(), ErrorModel(0.1))
+    rows = np.arange(scene)
+    part = BundleAdjustment(problem.truth.of(rows), o.of(rows), PolishOptions(), ErrorModel(0.1))
+    costs = [bounded_cost(b, 0.1, every) for b in (whole, part)]
+    # Of the walker's first frames something fits: it begins where the state has it.
+    assert costs[0] < costs[1] < 1.1 * costs[0]
+    assert costs[1] - bounded_cost(part, 0.1, len(part.observations.frame)) == pytest.approx(
+        2.0 * np.log1p(25.0) * WALKER * problem.frames
+    )
