@@ -65,6 +65,7 @@ def test_reconstruct_writes_the_result(
         "lens": "auto",
         "shutter": "auto",
         "control": None,
+        "imu": None,
         "preset": "default",
         "unordered": None,
         "features": "sift",

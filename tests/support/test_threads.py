@@ -34,6 +34,8 @@ def threads() -> tuple[int, list[int]]:
 
 @pytest.fixture(autouse=True)
 def _several_threads():
+    gc.collect()
+    OneThreadEach().close()  # gives back what a stream that another test has forgotten unclosed still holds
     before = cv2.getNumThreads()
     cv2.setNumThreads(3)
     yield
