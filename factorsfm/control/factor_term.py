@@ -8,26 +8,19 @@ free about the axes that the factors know something of, as of gravity, and its s
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.adjustment.state import State
 from factorsfm.control.residuals import ALIGNMENT, AlignedState, ControlTerm, MarkItem, Place
+from factorsfm.graph.factors_on_poses import FactorsOnPoses
+from factorsfm.support.rotations import camera_centers
 
 Array = NDArray[np.float64]
 
 _TURN_STD, SCALE_STD = 0.05, 0.3  # radians, and of the logarithm: from where on the factors know something of it
 _HELD = 1e12  # information of what is held
-
-
-class PoseFactors(Protocol):
-    """Factors as a function of poses and landmarks (`graph.factors_on_poses`)."""
-
-    def cost(self, rotation: Array, translation: Array, points: Array) -> float: ...
-    def quadratic(self, rotation: Array, translation: Array, points: Array) -> tuple[Array, Array]: ...
-    def errors(self, rotation: Array, translation: Array, points: Array) -> list[tuple[str, float]]: ...
 
 
 class FactorTerm:
@@ -44,7 +37,13 @@ class FactorTerm:
     """
 
     def __init__(
-        self, factors: PoseFactors, marks: Sequence[MarkItem], start: Array, anchor: Array, kernel: float, state: State
+        self,
+        factors: FactorsOnPoses,
+        marks: Sequence[MarkItem],
+        start: Array,
+        anchor: Array,
+        kernel: float,
+        state: State,
     ) -> None:
         self._factors = factors
         self._marks = ControlTerm(marks, start, anchor, np.ones(len(state.control), bool), kernel)
@@ -89,7 +88,7 @@ class FactorTerm:
         """Poses (`cam_from_world`) and landmarks in the world of the factors."""
         world = self.aligned(state).similarity
         rotation = state.rotation @ world.rotation.T
-        centers = world.points(-np.einsum("kji,kj->ki", state.rotation, state.translation))
+        centers = world.points(camera_centers(state.rotation, state.translation))
         points = world.points(state.control[ALIGNMENT:].reshape(-1, 3))
         return rotation, -np.einsum("kij,kj->ki", rotation, centers), points
 
@@ -97,15 +96,9 @@ class FactorTerm:
         """The factors alone, by the columns of the adjustment."""
         aligned = self.aligned(state)
         by_columns = np.zeros((6 * len(state.rotation) + len(state.control) - ALIGNMENT, aligned.columns.size))
-        alignment = aligned.first + np.arange(ALIGNMENT)
-        for row, rotation in enumerate(state.rotation):
-            _, _, by_place = aligned.known_place(Place(row, camera=True))
-            cam_from_world = rotation @ aligned.rotation.T
-            pose, columns = by_columns[6 * row : 6 * row + 6], aligned.columns.pose(row)
-            pose[:3, columns[:3]] = np.eye(3)
-            pose[3:, columns[3:]] = aligned.scale * np.eye(3)
-            pose[:3, alignment[:3]] = rotation @ aligned.own_turn
-            pose[3:, alignment] = cam_from_world @ by_place[:, 3:]
+        for row in range(len(state.rotation)):
+            columns, by_variables = aligned.known_pose(row)
+            by_columns[6 * row : 6 * row + 6, columns] = by_variables
         for row in range((len(state.control) - ALIGNMENT) // 3):
             _, columns, by_place = aligned.known_place(Place(row))
             begin = 6 * len(state.rotation) + 3 * row

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+_CONTRADICTION = 4.0  # standard deviations
+
 
 @dataclass(frozen=True, slots=True)
 class ControlResidual:
@@ -21,6 +23,11 @@ class ControlResidual:
     sigma: float
     sigmas: float
     contradicts: bool
+
+    @classmethod
+    def of(cls, name: str, unit: str, sigma: float, sigmas: float) -> ControlResidual:
+        """An item that is off by so many standard deviations."""
+        return cls(name, unit, sigmas * sigma, sigma, sigmas, sigmas > _CONTRADICTION)
 
 
 @dataclass(frozen=True, slots=True)

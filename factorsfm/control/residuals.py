@@ -80,6 +80,18 @@ class AlignedState:
         derivative = np.concatenate([self.scale * self.rotation @ by_place, by_alignment], 1)
         return self.scale * away + self.shift, np.append(columns, self.first + np.arange(ALIGNMENT)), derivative
 
+    def known_pose(self, row: int) -> tuple[Index, Array]:
+        """(13,) columns that a camera in the world of the control depends on, and the derivative (6, 13) by them.
+
+        Of its perturbation on the right as seen from the camera, in the control's unit of length.
+        """
+        _, _, by_place = self.known_place(Place(row, camera=True))
+        rotation, derivative = self.state.rotation[row], np.zeros((6, 6 + ALIGNMENT))
+        derivative[:, :6] = np.diag(np.repeat([1.0, self.scale], 3))
+        derivative[:3, 6:9] = rotation @ self.own_turn
+        derivative[3:, 6:] = rotation @ self.rotation.T @ by_place[:, 3:]
+        return np.append(self.columns.pose(row), self.first + np.arange(ALIGNMENT)), derivative
+
     @property
     def own_turn(self) -> Array:
         """(3, 3) small rotation of the alignment on its right, as of a pose, by its rotation vector."""

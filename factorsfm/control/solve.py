@@ -18,7 +18,7 @@ from factorsfm.adjustment.problem import Free, Known
 from factorsfm.adjustment.state import State
 from factorsfm.control.fit import ControlFit, ControlResidual
 from factorsfm.control.known import LocatedControl
-from factorsfm.control.residuals import ALIGNMENT, AlignedState, ControlTerm, Item, Place
+from factorsfm.control.residuals import AlignedState, ControlTerm, Item
 from factorsfm.control.solved_control import SolvedControl
 from factorsfm.control.start import start_under_control
 from factorsfm.support.errors import ReconstructionError
@@ -29,8 +29,7 @@ Array = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
 
-_KERNEL = 3.0  # Cauchy scale of the control, standard deviations
-_CONTRADICTION = 4.0  # standard deviations
+KERNEL = 3.0  # Cauchy scale of the control, standard deviations
 _STEPS, _TOLERANCE = 25, 2e-5
 _COLLAPSE = 10.0  # fall of the logarithm of the scale with which a scene vanishes
 _POINT_STEPS = 5  # of the points alone, after cameras were put where they are held
@@ -74,7 +73,7 @@ def solve_under_control(
     control = SolvedControl(located, marks, frames, adjustment.state)
     state, term, held = start_under_control(control, adjustment.state)
     begin = float(state.control[6])  # log of the scale
-    options = replace(adjustment.options, point_sigma=_POINT_SIGMA, iterations=_STEPS, tolerance=_TOLERANCE)
+    options = options_under_control(adjustment.options)
     if control.held:
         points_only = BundleAdjustment(
             state, adjustment.observations, options, adjustment.errors, free=Free(cameras=False)
@@ -98,6 +97,11 @@ def solve_under_control(
     )  # fmt: skip
 
 
+def options_under_control(options: PolishOptions) -> PolishOptions:
+    """Those of the last solution, which may change the shape of the scene."""
+    return replace(options, point_sigma=_POINT_SIGMA, iterations=_STEPS, tolerance=_TOLERANCE)
+
+
 def frames_under_control(registered: list[int], control: LocatedControl, limit: int) -> list[int]:
     """Registered frames that the control refers to; of very many, those that are held and some of the others."""
     held = {control.position[pose.frame] for pose in control.control.poses if pose.held}
@@ -115,7 +119,7 @@ def _converged(
     typical = float(np.median(sizes)) if sizes else 0.0
     solved = adjustment
     # At a start far away, a narrow kernel would take all control for outliers.
-    for kernel in sorted({max(_KERNEL, 2.0 * typical), _KERNEL}, reverse=True):
+    for kernel in sorted({max(KERNEL, 2.0 * typical), KERNEL}, reverse=True):
         term.kernel = kernel
         solved = BundleAdjustment(
             state, adjustment.observations, options, adjustment.errors,
@@ -160,7 +164,7 @@ def _residuals(term: ControlTerm, state: State) -> list[ControlResidual]:
 
 def _residual(item: Item, residual: Array) -> ControlResidual:
     sigmas = float(np.linalg.norm(residual))
-    return ControlResidual(item.name, item.unit, sigmas * item.sigma, item.sigma, sigmas, sigmas > _CONTRADICTION)
+    return ControlResidual.of(item.name, item.unit, item.sigma, sigmas)
 
 
 def _pose_covariances(marginals: Marginals, aligned: AlignedState) -> tuple[Array, Array]:
@@ -168,18 +172,9 @@ def _pose_covariances(marginals: Marginals, aligned: AlignedState) -> tuple[Arra
 
     A change of the world alignment turns and moves all cameras: ``R (s x) + T`` by its variables, seen from the camera.
     """
-    state, columns = aligned.state, aligned.columns
-    derivatives = np.zeros((len(state.rotation), 6, 6 + ALIGNMENT))
-    used = np.empty((len(state.rotation), 6 + ALIGNMENT), np.int64)
-    for row, rotation in enumerate(state.rotation):
-        _, _, by_place = aligned.known_place(Place(row, camera=True))
-        world_from_cam = aligned.rotation @ rotation.T
-        derivative = derivatives[row]
-        derivative[:, :6] = np.eye(6)
-        derivative[:3, 6:9] = rotation @ aligned.own_turn
-        derivative[3:, 6:] = world_from_cam.T @ by_place[:, 3:] / aligned.scale
-        used[row] = np.append(columns.pose(row), aligned.first + np.arange(ALIGNMENT))
-    return pose_covariances(marginals.camera, derivatives, used, state)
+    used, derivatives = zip(*(aligned.known_pose(row) for row in range(len(aligned.state.rotation))), strict=True)
+    in_polish = np.repeat([1.0, 1.0 / aligned.scale], 3)[:, None]
+    return pose_covariances(marginals.camera, in_polish * np.array(derivatives), np.array(used), aligned.state)
 
 
 def _by_size(aligned: AlignedState) -> Array:

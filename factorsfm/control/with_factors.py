@@ -12,20 +12,16 @@ from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import Free, Known
 from factorsfm.adjustment.state import State
-from factorsfm.control.factor_term import SCALE_STD, FactorTerm, PoseFactors
+from factorsfm.control.factor_term import SCALE_STD, FactorTerm
 from factorsfm.control.fit import ControlFit, ControlResidual
 from factorsfm.control.residuals import MarkItem, Place
-from factorsfm.control.solve import Controlled, described
+from factorsfm.control.solve import KERNEL, Controlled, described, options_under_control
 from factorsfm.control.solved_control import triangulated
+from factorsfm.graph.factors_on_poses import FactorsOnPoses
 from factorsfm.support.rotations import camera_centers
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-
-_KERNEL = 3.0  # Cauchy scale of the observations of landmarks, standard deviations
-_CONTRADICTION = 4.0  # standard deviations
-_STEPS, _TOLERANCE = 25, 2e-5
-_POINT_SIGMA = 5.0  # a weak prior of the points: factors may change the shape of the scene
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +37,7 @@ class ShotFactors:
     frames: list[int]
     tracks: Index
     poses: dict[int, tuple[Array, Array]]
-    on_poses: Callable[[Sequence[int], Sequence[int]], PoseFactors]
+    on_poses: Callable[[Sequence[int], Sequence[int]], FactorsOnPoses]
 
 
 def solve_with_factors(
@@ -60,18 +56,13 @@ def solve_with_factors(
     rotation, anchor, shift, scale = _alignment(state, factors, frames)
     state = replace(state, control=np.concatenate([np.zeros(3), shift, [np.log(scale)], places.ravel()]))
     on_poses = factors.on_poses(frames, factors.tracks[placed].tolist())
-    term = FactorTerm(on_poses, _items(marks, adjustment.sigma), rotation, anchor, _KERNEL, state)
+    term = FactorTerm(on_poses, _items(marks, adjustment.sigma), rotation, anchor, KERNEL, state)
     solved = BundleAdjustment(
-        state, adjustment.observations,
-        replace(adjustment.options, point_sigma=_POINT_SIGMA, iterations=_STEPS, tolerance=_TOLERANCE),
-        adjustment.errors, prior=adjustment.prior, free=Free(held=np.arange(len(frames)) == 0),
-        known=Known(control=term),
+        state, adjustment.observations, options_under_control(adjustment.options), adjustment.errors,
+        prior=adjustment.prior, free=Free(held=np.arange(len(frames)) == 0), known=Known(control=term),
     )  # fmt: skip
     solved.solve()
-    residuals = [
-        ControlResidual(name, "sigma", error, 1.0, error, error > _CONTRADICTION)
-        for name, error in term.errors(solved.state)
-    ]
+    residuals = [ControlResidual.of(name, "sigma", 1.0, error) for name, error in term.errors(solved.state)]
     controlled = described(solved, term, lambda scale_std, position_std: ControlFit(
         residuals, [], [], placed=True, scale_std=scale_std, position_std=position_std, source="factors",
     ))  # fmt: skip
