@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import gtsam
@@ -14,8 +14,8 @@ from factorsfm.graph.added_factors import AddedFactors
 from factorsfm.graph.contents import LiveGraph, empty_graph
 from factorsfm.graph.factors import pose_from_camera
 from factorsfm.graph.factors_on_poses import FactorsOnPoses
-from factorsfm.graph.inertial_factors import inertial_factor, inertial_graph, preintegrated
-from factorsfm.inertial.alignment import InertialAlignment
+from factorsfm.graph.inertial_factors import inertial_factor, preintegrated
+from factorsfm.graph.keys import letter_of
 from factorsfm.inertial.recording import ImuRecording
 
 Array = NDArray[np.float64]
@@ -36,13 +36,6 @@ class InertialState:
     gravity: Array
     gyroscope_bias: Array
     accelerometer_bias: Array
-
-
-def first_inertial_factors(
-    recording: ImuRecording, frames: Sequence[int], time: Array, alignment: InertialAlignment
-) -> LiveGraph:
-    """Factors between the keyframes of an alignment, and first values of the variables; see `inertial_graph`."""
-    return inertial_graph(recording, frames, time, alignment, GRAVITY_KEY)
 
 
 def next_inertial_factor(
@@ -93,7 +86,7 @@ def posterior_state(
     """
     graph, values = factors.with_poses(poses)
     solved = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
-    first = min(gtsam.symbolIndex(key) for key in list(solved.keys()) if key == B(gtsam.symbolIndex(key)))
+    first = min(gtsam.symbolIndex(key) for key in list(solved.keys()) if letter_of(key) == "b")
     bias, gravity = solved.atConstantBias(B(first)), solved.atPoint3(GRAVITY_KEY)
     covariance = gtsam.Marginals(graph, solved).marginalCovariance(GRAVITY_KEY)
     across = np.eye(3) - np.outer(gravity, gravity) / (gravity @ gravity)

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 
 from factorsfm.inertial.reading import read_imu
 from factorsfm.inertial.recording import ImuNoise, ImuRecording
 from factorsfm.support.errors import InputError
 from factorsfm.support.json_reading import read_json
+
+Array = NDArray[np.float64]
 
 _KEYS = ("file", "cam_from_imu", "lever_arm", "time_offset", "noise")
 
@@ -40,7 +42,7 @@ def open_imu(path: str | Path) -> ImuRecording:
         return replace(
             recording,
             cam_from_imu=_rotation(content.get("cam_from_imu")),
-            lever_arm=_numbers(content, "lever_arm", 3) if "lever_arm" in content else np.zeros(3),
+            lever_arm=_numbers("lever_arm", content.get("lever_arm", [0, 0, 0]), 3),
             time_offset=_number("time_offset", content["time_offset"]) if "time_offset" in content else None,
             noise=_noise(content.get("noise", {})),
         )
@@ -48,18 +50,16 @@ def open_imu(path: str | Path) -> ImuRecording:
         raise InputError(f"IMU file {path}: {error}") from error
 
 
-def _numbers(content: Mapping[str, Any], name: str, count: int) -> np.ndarray[Any, np.dtype[np.float64]]:
-    value = content[name]
-    good = isinstance(value, list) and len(value) == count
-    if not good or not all(isinstance(v, int | float) and not isinstance(v, bool) for v in value):
+def _numbers(name: str, value: Any, count: int) -> Array:
+    if not isinstance(value, list) or len(value) != count or not all(map(_is_number, value)):
         raise InputError(f'"{name}" is {value!r}; {count} numbers are expected')
     return np.array(value, np.float64)
 
 
-def _rotation(value: Any) -> np.ndarray[Any, np.dtype[np.float64]] | None:
+def _rotation(value: Any) -> Array | None:
     if value is None:
         return None
-    quaternion = _numbers({"cam_from_imu": value}, "cam_from_imu", 4)
+    quaternion = _numbers("cam_from_imu", value, 4)
     if not abs(np.linalg.norm(quaternion) - 1.0) < 1e-3:
         raise InputError(f'"cam_from_imu" is {value}; a unit quaternion is expected')
     return np.asarray(pycolmap.Rotation3d(quaternion).matrix())
@@ -73,6 +73,10 @@ def _noise(value: Any) -> ImuNoise:
 
 
 def _number(name: str, value: Any) -> float:
-    if not isinstance(value, int | float) or isinstance(value, bool):
+    if not _is_number(value):
         raise InputError(f'"{name}" is {value!r}; a number is expected')
     return float(value)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)

@@ -84,7 +84,6 @@ class EndedShot:
             result.notes.append(f"Frames that went without depth because the prior failed: {count}; {first}.")
         if self.imu is not None:
             on_poses = None if factors is None else factors.on_poses(polished.frames, [])
-            assert on_poses is None or isinstance(on_poses, FactorsOnPoses)
             add_imu(result, self.imu, on_poses, lens_given=self.lens_given)
         if self.mapper.without_prior:
             result.notes.append(f"The map went on without the depth prior: {self.mapper.without_prior}.")

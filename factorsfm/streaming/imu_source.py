@@ -10,13 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.graph.inertial_chain import first_inertial_factors, inertial_state, next_inertial_factor
+from factorsfm.graph.inertial_chain import GRAVITY_KEY, inertial_state, next_inertial_factor
+from factorsfm.graph.inertial_factors import inertial_graph
 from factorsfm.inertial.alignment import VisualPoses, align_inertial
 from factorsfm.inertial.recording import ImuRecording
 from factorsfm.inertial.timing import ImuTiming, fit_timing
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.mapping.mapper import Mapper
 from factorsfm.support.errors import FactorsfmError, InputError
+from factorsfm.support.rotations import camera_centers
 
 Array = NDArray[np.float64]
 
@@ -38,7 +40,7 @@ class ImuSource:
         recording: what is unknown of its clock and axes is estimated.
 
     Attributes:
-        timing: the fit of its clock and axes, once there is one.
+        timing: the fit of its clock and axes, once there is one; recording: as an IMU in the camera would have it then.
         reason: why it takes no part yet, empty while it does.
 
     Raises:
@@ -48,7 +50,7 @@ class ImuSource:
     def __init__(self, recording: ImuRecording) -> None:
         if not isinstance(recording, ImuRecording):
             raise InputError(f"the IMU is of type {type(recording).__name__}; the ImuRecording of open_imu is expected")
-        self._given = recording
+        self._given = self.recording = recording
         self.timing: ImuTiming | None = None
         self.reason = "the video has not begun"
         self._last: int | None = None  # position of the newest keyframe with a factor
@@ -64,11 +66,11 @@ class ImuSource:
         """Go on where `state` was taken."""
         for name in _STATE:
             setattr(self, name, state[name])
+        if self.timing is not None:
+            self._take(self.timing)
 
-    @property
-    def recording(self) -> ImuRecording:
-        """With clock and axes as far as they are known."""
-        return self._given if self.timing is None else self.timing.applied(self._given)
+    def _take(self, timing: ImuTiming) -> None:
+        self.timing, self.recording = timing, timing.applied(self._given).at_camera()
 
     @property
     def takes_part(self) -> bool:
@@ -103,7 +105,6 @@ class ImuSource:
             self._add_factors(mapper, finished=True)
 
     def _add_factors(self, mapper: Mapper, *, finished: bool) -> None:
-        times = self._times
         if mapper.starts_anew:
             self._last, self.reason = None, "the map was started anew"
         if len(mapper.keyframes) == self._seen and not finished:
@@ -113,9 +114,9 @@ class ImuSource:
             self._last, self.reason = None, "the images contradict its factors"
         try:
             if self._last is None:
-                self._begin(mapper, times, finished)
+                self._begin(mapper, finished)
             if self._last is not None:
-                self._go_on(mapper, times)
+                self._go_on(mapper)
         except FactorsfmError as error:
             self.reason = str(error)
             logger.debug("IMU: %s", error)
@@ -126,7 +127,8 @@ class ImuSource:
         frame = mapper.images[self._last].tracks.frame
         return inertial_state(mapper.additions.present(), frame) is not None
 
-    def _begin(self, mapper: Mapper, times: Sequence[float], finished: bool) -> None:
+    def _begin(self, mapper: Mapper, finished: bool) -> None:
+        times = self._times
         positions = _spaced(mapper.keyframes, times)[-_MOST_KEYFRAMES:]
         span = times[positions[-1]] - times[mapper.keyframes[0]] if positions else 0.0
         early = len(positions) < _FIRST_KEYFRAMES or span < _FIRST_SECONDS
@@ -134,8 +136,8 @@ class ImuSource:
             self.reason = f"{len(positions)} keyframes in {span:.1f} s are too few to find its scale"
             return
         self._attempt = times[-1]
-        self.timing = fit_timing(self._given, np.array(times), _rotations(mapper.images))
-        start, end = self.recording.time[[0, -1]] + self.timing.time_offset
+        self._take(fit_timing(self._given, np.array(times), _rotations(mapper.images)))
+        start, end = self.recording.time[[0, -1]]
         positions = [position for position in positions if start <= times[position] <= end]
         images = [mapper.images[position] for position in positions]
         time = np.array([times[position] for position in positions])
@@ -143,10 +145,11 @@ class ImuSource:
         if alignment.log_scale_sigma > _LARGEST_SCALE_STD and not finished:
             raise InputError(f"the motion shows the scale to {100 * alignment.log_scale_sigma:.1f} % so far")
         frames = [image.tracks.frame for image in images]
-        mapper.add_factors(*first_inertial_factors(self.recording, frames, time, alignment))
+        mapper.add_factors(*inertial_graph(self.recording, frames, time, alignment, GRAVITY_KEY))
         self._last, self.reason = positions[-1], ""
 
-    def _go_on(self, mapper: Mapper, times: Sequence[float]) -> None:
+    def _go_on(self, mapper: Mapper) -> None:
+        times = self._times
         assert self._last is not None
         for position in _spaced(mapper.keyframes, times):
             if times[position] - times[self._last] < _LEAST_INTERVAL:
@@ -174,8 +177,7 @@ def _rotations(images: Sequence[MappedImage]) -> Array:
 
 
 def _visual_poses(images: Sequence[MappedImage], time: Array) -> VisualPoses:
-    rotations = _rotations(images)
-    centers = np.array([-image.pose[0].T @ image.pose[1] for image in images])
+    turns, shifts = (np.array(part) for part in zip(*(image.pose for image in images), strict=True))
     exact = _EXACT * np.eye(6)
     covariance = np.array([exact if image.covariance is None else image.covariance for image in images])
-    return VisualPoses(time, rotations, centers, covariance)
+    return VisualPoses(time, turns.transpose(0, 2, 1), camera_centers(turns, shifts), covariance)

@@ -93,9 +93,8 @@ class Stream(Closing):
     ) -> None:
         if control is not None and imu is not None:
             raise InputError("control and an IMU cannot both set the scale; give one of them")
-        self.camera = camera
+        self.camera, self._lens_given = camera, camera is not None
         self._imu = ImuSource(imu) if imu is not None else None
-        self._lens_given = camera is not None
         self.control = control
         self.options = options or Options()
         self.seconds = StageSeconds()
@@ -141,9 +140,8 @@ class Stream(Closing):
         with self.seconds.of("mapping"):
             mapper.advance()
         focal_changed |= self._follow_focal(mapper)
-        tracks = ImageTracks(
-            len(self.frames), tracked.ids, tracked.xy, self.camera, index=self._indices.take(frame.index)
-        )
+        index = self._indices.take(frame.index)
+        tracks = ImageTracks(len(self.frames), tracked.ids, tracked.xy, self.camera, index=index)
         tracks = tracks.of(tracks.invertible & (tracked.texture >= BLANK_TEXTURE))  # a blank image's tracks are noise
         with self.seconds.of("mapping"):
             if self._imu is not None:
@@ -381,8 +379,8 @@ class Stream(Closing):
     def _new_mapper(self) -> Mapper:
         assert self.camera is not None
         self._held.enter_context(OneThreadEach())
-        focal = 0.5 * (self.camera.focal_length_x + self.camera.focal_length_y)
-        return Mapper(self._graph, focal, self._size[0], self.options, has_prior=self._depth is not None)
+        focal, has_prior = self.camera.mean_focal_length(), self._depth is not None
+        return Mapper(self._graph, focal, self._size[0], self.options, has_prior=has_prior)
 
     def _read_depth(self, frame: Frame, xy: NDArray[np.float64]) -> ImageDepth | None:
         """The prior at keypoints; once there is a map, a frame on which it fails goes without."""
