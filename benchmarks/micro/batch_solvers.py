@@ -50,6 +50,11 @@ class Problem:
     true_rotations: Array
     true_centers: Array
 
+    def state(self, points: Array) -> State:
+        """The start, with these points (n, 3)."""
+        length = np.linalg.norm(points, axis=1)
+        return State(self.rotation, self.translation, points / length[:, None], 1.0 / length, np.log([self.focal]))
+
 
 def batch_problem(frames: int, points: int) -> Problem:
     """A handheld shot of small parallax, with a start that is as far off as an incremental map."""
@@ -106,11 +111,8 @@ def batch_solvers() -> str:
 
 
 def _solve_numpy(problem: Problem) -> tuple[Array, Array, int]:
-    length = np.linalg.norm(problem.points, axis=1)
-    bearing = problem.points / length[:, None]
-    state = State(problem.rotation, problem.translation, bearing, 1.0 / length, np.log([problem.focal]))
     options = PolishOptions(kernel=KERNEL, tolerance=_TOLERANCE, iterations=_ITERATIONS)
-    adjustment = BundleAdjustment(state, problem.observations, options, ErrorModel(PIXEL_SIGMA))
+    adjustment = BundleAdjustment(problem.state(problem.points), problem.observations, options, ErrorModel(PIXEL_SIGMA))
     done = adjustment.solve()
     rotations = done.rotation.transpose(0, 2, 1)
     return rotations, -np.einsum("nij,nj->ni", rotations, done.translation), adjustment.iterations

@@ -15,7 +15,6 @@ from benchmarks.micro.batch_solvers import Problem, batch_problem
 from benchmarks.micro.timing import KERNEL, PIXEL_SIGMA, seconds
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.problem import ErrorModel, Free
-from factorsfm.adjustment.state import State
 from factorsfm.graph.factors import (
     camera_from_pose,
     constant_projection_factor,
@@ -103,22 +102,10 @@ def _points(problem: Problem) -> dict[str, Callable[[], str]]:
     o = problem.observations
 
     def error(points: Array) -> str:
-        length = np.linalg.norm(points, axis=1)
-        state = State(
-            problem.rotation, problem.translation, points / length[:, None], 1.0 / length, np.log([problem.focal])
-        )
-        return f"{np.median(_adjustment(problem, state).reprojection_errors()):.3f}"
+        return f"{np.median(_adjustment(problem, points).reprojection_errors()):.3f}"
 
     def ours() -> str:
-        length = np.linalg.norm(problem.points, axis=1)
-        state = State(
-            problem.rotation,
-            problem.translation,
-            problem.points / length[:, None],
-            1.0 / length,
-            np.log([problem.focal]),
-        )
-        return error(_adjustment(problem, state).solve(_POINT_STEPS).points)
+        return error(_adjustment(problem, problem.points).solve(_POINT_STEPS).points)
 
     def native() -> str:
         lens, noise = lens_of(problem.focal), pixel_noise(PIXEL_SIGMA)
@@ -137,6 +124,9 @@ def _points(problem: Problem) -> dict[str, Callable[[], str]]:
     return {"numpy": ours, "GTSAM LM": native}
 
 
-def _adjustment(problem: Problem, state: State) -> BundleAdjustment:
-    options = PolishOptions(kernel=KERNEL)
-    return BundleAdjustment(state, problem.observations, options, ErrorModel(PIXEL_SIGMA), free=Free(cameras=False))
+def _adjustment(problem: Problem, points: Array) -> BundleAdjustment:
+    """Of the points alone, which begin there."""
+    return BundleAdjustment(
+        problem.state(points), problem.observations, PolishOptions(kernel=KERNEL), ErrorModel(PIXEL_SIGMA),
+        free=Free(cameras=False),
+    )  # fmt: skip
