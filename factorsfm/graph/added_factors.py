@@ -16,14 +16,14 @@ import numpy as np
 from gtsam.symbol_shorthand import A, L, X
 from numpy.typing import NDArray
 
-from factorsfm.graph.factors import landmark_prior, native_affine, pose_from_camera, pose_prior
+from factorsfm.graph.factors import HELD, landmark_prior, native_affine, pose_from_camera, pose_prior
+from factorsfm.graph.keys import keys_of, letter_of, name_of, ordering_of, part_of
 from factorsfm.graph.window import Window
 
 Array = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
 
-HELD = 1e-6  # standard deviation of what is constant
 _GROSS = 30.0  # standard deviations, of a factor that is grossly off
 RESERVED = {
     "x": "a keyframe of the map", "l": "a landmark of the map", "a": "a keyframe with a depth map",
@@ -84,12 +84,15 @@ class AddedFactors:
         """The landmarks that they name."""
         return {gtsam.symbolIndex(key) for key in self.named if letter_of(key) == "l"}
 
-    def joined(self, other: AddedFactors) -> AddedFactors:
-        """With the factors of another, whose numbers differ."""
-        graph, values = self.graph(), self.values()
-        graph.push_back(other.graph())
-        values.insert(other.values())
-        return AddedFactors.of((*self.numbers, *other.numbers), graph, values)
+    @classmethod
+    def joined(cls, batches: Iterable[AddedFactors]) -> AddedFactors:
+        """The factors of several batches, whose numbers differ."""
+        numbers, graph, values = list[int](), gtsam.NonlinearFactorGraph(), gtsam.Values()
+        for batch in batches:
+            numbers += batch.numbers
+            graph.push_back(batch.graph())
+            values.insert(batch.values())
+        return cls.of(numbers, graph, values)
 
     def with_values(self, estimate: gtsam.Values) -> AddedFactors:
         """With the caller's variables as they are in an estimate of many."""
@@ -108,29 +111,9 @@ class MapValues(Protocol):
     def landmark(self, track: int) -> Array | None: ...
 
 
-def letter_of(key: int) -> str:
-    """The character of a key's symbol."""
-    return chr(gtsam.symbolChr(key))
-
-
-def name_of(key: int) -> str:
-    """A key as GTSAM writes it."""
-    return str(gtsam.DefaultKeyFormatter(key))
-
-
 def is_own(key: int) -> bool:
     """Whether a variable is the caller's, and not one of the graph's."""
     return letter_of(key) not in RESERVED
-
-
-def keys_of(graph: gtsam.NonlinearFactorGraph) -> set[int]:
-    """The variables of some factors."""
-    return {key for k in range(graph.size()) for key in list(graph.at(k).keys())}
-
-
-def part_of(values: gtsam.Values, keys: Iterable[int]) -> gtsam.Values:
-    """The values of some variables, of those that there are."""
-    return values.extract([key for key in keys if values.exists(key)])
 
 
 def present_values(keys: Iterable[int], present: MapValues) -> gtsam.Values:
@@ -172,15 +155,16 @@ def on_window(added: AddedFactors, window: Window, present: MapValues) -> tuple[
     free = set(window.keyframes[~window.constant].tolist())
     guided = set() if window.depths is None else free & set(window.keyframes[window.depths.image].tolist())
     variables = {*map(X, free), *map(L, window.ids.tolist()), *map(A, guided)}
-    added = _without_lost(added, present_values(added.named, present))
-    constants = present_values(added.named - variables, present)
+    named = added.named
+    known = present_values(named, present)
+    added = _without_lost(added, {key for key in named if not known.exists(key)})
+    constants = part_of(known, named - variables)
     added = condensed(added, variables, constants)
     return added, part_of(constants, added.named)
 
 
-def _without_lost(added: AddedFactors, present: gtsam.Values) -> AddedFactors:
+def _without_lost(added: AddedFactors, lost: set[int]) -> AddedFactors:
     """Without factors on what the map has lost, as a landmark that turned out to be wrong."""
-    lost = {key for key in added.named if not present.exists(key)}
     if not lost:
         return added
     graph, kept, numbers = added.graph(), gtsam.NonlinearFactorGraph(), []
@@ -213,10 +197,8 @@ def condensed(added: AddedFactors, free: Collection[int], constants: gtsam.Value
     everything.insert(own)
     for key in list(part_of(constants, keys_of(settled)).keys()):
         settled.add(held_prior(key, constants))
-    ordering = gtsam.Ordering()
-    for key in sorted(keys_of(settled) - used):
-        ordering.push_back(key)
-    _, left = settled.linearize(everything).eliminatePartialSequential(ordering)
+    gone = ordering_of(sorted(keys_of(settled) - used))
+    _, left = settled.linearize(everything).eliminatePartialSequential(gone)
     following = max(added.numbers) + 1
     for k in range(left.size()):
         if len(left.at(k).keys()):

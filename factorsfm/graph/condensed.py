@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
+from itertools import accumulate
 
 import gtsam
 import numpy as np
@@ -12,13 +13,13 @@ from numpy.typing import NDArray
 
 from factorsfm.adjustment.semidefinite import conditioned
 from factorsfm.graph.explicit_graph import SolvedShot, measurements
+from factorsfm.graph.keys import letter_of
 from factorsfm.support.errors import InputError
 from factorsfm.support.threads import OneThreadEach
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-_SIZES = {"a": 5, "k": 5, "l": 3, "t": 6, "x": 6}  # of the variables of `factor_graph`
 _CHUNK = 16  # points eliminated together
 
 
@@ -53,7 +54,9 @@ def condensed_factor(
     graph, values = measurements(reconstruction)
     with OneThreadEach():
         system = _LinearSystem.of(graph.linearize(values), values)
-        information = _kept(system.condensed(), system.outer, [X(i) for i in wanted])
+        dimensions = values.dims()
+        outer = {key: dimensions[key] for key in system.outer}
+        information = _kept(system.condensed(), outer, [X(i) for i in wanted])
     at = gtsam.Values()
     for i in wanted:
         at.insert(X(i), values.atPose3(X(i)))
@@ -85,8 +88,8 @@ class _LinearSystem:
     def of(cls, linear: gtsam.GaussianFactorGraph, values: gtsam.Values) -> _LinearSystem:
         """The equations of a graph of `measurements`."""
         keys = sorted(values.keys())
-        kinds = np.array([chr(gtsam.Symbol(key).chr()) for key in keys])
-        sizes = np.array([_SIZES[kind] for kind in kinds])
+        kinds, dimensions = np.array([letter_of(key) for key in keys]), values.dims()
+        sizes = np.array([dimensions[key] for key in keys])
         variable = np.append(np.repeat(np.arange(len(keys)), sizes), len(keys))  # of each column
         kind = np.append(kinds, "")[variable]
         row, column, value = linear.sparseJacobian_()
@@ -162,10 +165,13 @@ def _root(information: Array) -> Array:
         return np.asarray(np.linalg.cholesky(conditioned(information)))
 
 
-def _kept(information: Array, keys: list[int], wanted: list[int]) -> Array:
-    """The bordered information of some variables, in their order, the others eliminated."""
-    sizes = np.array([_SIZES[chr(gtsam.Symbol(key).chr())] for key in keys])
-    first = dict(zip(keys, (np.cumsum(sizes) - sizes).tolist(), strict=True))
+def _kept(information: Array, sizes: dict[int, int], wanted: list[int]) -> Array:
+    """The bordered information of some poses, in their order, the others eliminated.
+
+    Args:
+        sizes: of all variables, in the order of the columns.
+    """
+    first = dict(zip(sizes, accumulate(sizes.values(), initial=0), strict=False))
     kept = np.append(np.concatenate([first[key] + np.arange(6) for key in wanted]), len(information) - 1)
     gone = np.setdiff1d(np.arange(len(information)), kept)
     size = np.sqrt(np.diag(information)[gone])

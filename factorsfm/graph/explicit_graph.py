@@ -15,22 +15,26 @@ from factorsfm.adjustment.noise import coordinate_sigma
 from factorsfm.adjustment.track_errors import STRETCH
 from factorsfm.camera.projection import normalized_from_pixels
 from factorsfm.graph.factors import (
+    HELD,
     affine_prior,
     landmark_prior,
+    lens_of,
+    lens_projection_factor,
     native_affine,
     native_depth_factor,
+    pixel_noise,
     pose_from_camera,
     pose_prior,
+    projection_factor,
     virtual_offset,
 )
 from factorsfm.priors.affine import SCALE_SIGMA
-from factorsfm.support.options import PolishOptions
 from factorsfm.support.status import ShotKind
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-_HELD, _FREE = 1e-6, 1e3  # standard deviations of what is constant, and of what is not
+_FREE = 1e3  # standard deviation of what is not constant
 _PINNED = 1e-6  # standard deviation of what a calibration shares with the lens, in focal lengths
 _WEAK = 100.0  # standard deviation of a point's prior, in units of its distance
 
@@ -122,7 +126,7 @@ def factor_graph(reconstruction: SolvedShot) -> tuple[gtsam.NonlinearFactorGraph
     """
     graph, values = measurements(reconstruction)
     first = X(min(frame.index for frame in reconstruction.frames if frame.cam_from_world is not None))
-    graph.add(gtsam.PriorFactorPose3(first, values.atPose3(first), gtsam.noiseModel.Isotropic.Sigma(6, _HELD)))
+    graph.add(pose_prior(first, values.atPose3(first), HELD))
     return graph, values
 
 
@@ -147,7 +151,7 @@ def _registered_rows(r: SolvedShot) -> Index:
 
 def _add_poses(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, r: SolvedShot) -> None:
     """The poses with weak priors, at the place of the first where the camera does not move."""
-    first, together = None, gtsam.noiseModel.Diagonal.Sigmas(np.repeat([_FREE, _HELD], 3))
+    first, together = None, gtsam.noiseModel.Diagonal.Sigmas(np.repeat([_FREE, HELD], 3))
     for frame in r.frames:
         if (pose := frame.cam_from_world) is None:
             continue
@@ -162,12 +166,8 @@ def _add_poses(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, r: Solve
 
 def _add_projections(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, r: SolvedShot, rows: Index) -> None:
     """The observations `rows` of points, and the errors that their tracks keep."""
-    focal, noise = r.camera.mean_focal_length(), gtsam.noiseModel
-    lens, frame_of, point_of = (
-        gtsam.Cal3_S2(focal, focal, 0, 0, 0),
-        r.observation_frame[rows],
-        r.observation_point[rows],
-    )
+    focal, frame_of, point_of = r.camera.mean_focal_length(), r.observation_frame[rows], r.observation_point[rows]
+    lens = lens_of(focal)
     observed, predicted, ratio = np.empty((len(rows), 2)), np.empty((len(rows), 2)), np.empty(len(rows))
     seen = r.observation_xy[rows] if r.rolled is None else (r.observation_xy - r.rolled)[rows]
     for i in np.unique(frame_of):
@@ -178,20 +178,18 @@ def _add_projections(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, r:
         ratio[mine] = focal / camera.mean_focal_length()
     keys = [X(r.frames[i].index) for i in frame_of], [L(j) for j in r.track_ids[point_of].tolist()]
     if r.noise is None:
-        kernel = noise.mEstimator.Cauchy.Create(PolishOptions().kernel)
         sigma = (ratio * coordinate_sigma(r.observation_error[rows])).tolist()
         for xy, s, pose, point in zip(observed, sigma, *keys, strict=True):
-            robust = noise.Robust.Create(kernel, noise.Isotropic.Sigma(2, s))
-            graph.add(gtsam.GenericProjectionFactorCal3_S2(xy, robust, pose, point, lens))
+            graph.add(projection_factor(xy, pixel_noise(s), pose, point, lens))
         return
     sigma = ratio * r.noise.pixel[rows]
     slid = _slid_calibrations(graph, values, r, rows, predicted - observed, sigma, lens)
     for xy, s, pose, point, n in zip(observed, sigma.tolist(), *keys, slid.tolist(), strict=True):
-        pixel = noise.Isotropic.Sigma(2, s)
+        pixel = gtsam.noiseModel.Isotropic.Sigma(2, s)
         if n < 0:
-            graph.add(gtsam.GenericProjectionFactorCal3_S2(xy, pixel, pose, point, lens))
+            graph.add(projection_factor(xy, pixel, pose, point, lens))
         else:
-            graph.add(gtsam.GeneralSFMFactor2Cal3_S2(xy, pixel, pose, point, K(n)))
+            graph.add(lens_projection_factor(xy, pixel, pose, point, K(n)))
 
 
 def _slid_calibrations(
@@ -232,7 +230,7 @@ def _slid_calibrations(
 def _add_depths(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, r: SolvedShot, rows: Index) -> None:
     """The values of the prior at the observations `rows`, with the affines of its maps."""
     values.insert(T(0), virtual_offset())
-    graph.add(pose_prior(T(0), virtual_offset(), _HELD))
+    graph.add(pose_prior(T(0), virtual_offset(), HELD))
     if r.noise is None:
         return
     rows = rows[np.isfinite(r.prior_residual[rows])]

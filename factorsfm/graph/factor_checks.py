@@ -7,17 +7,8 @@ from collections.abc import Collection, Sequence
 import gtsam
 import numpy as np
 
-from factorsfm.graph.added_factors import (
-    RESERVED,
-    AddedFactors,
-    MapValues,
-    is_own,
-    keys_of,
-    letter_of,
-    name_of,
-    part_of,
-    present_values,
-)
+from factorsfm.graph.added_factors import RESERVED, AddedFactors, MapValues, is_own, present_values
+from factorsfm.graph.keys import keys_of, letter_of, name_of, part_of
 from factorsfm.graph.linear_system import LinearSystem
 from factorsfm.support.errors import InputError
 
@@ -49,12 +40,13 @@ def checked_factors(
         )
     for k in range(graph.size()):
         _check_crosses(graph.at(k), k)
-    known = present_values(keys_of(graph), present)
+    named = keys_of(graph)
+    known = present_values(named, present)
     for added in earlier:
         own = added.values()
         known.insert(part_of(own, [key for key in list(own.keys()) if not known.exists(key)]))
     _check_keys(graph, values, known, names)
-    everything = part_of(known, keys_of(graph))
+    everything = part_of(known, named)
     everything.insert(values)
     _check_linear(graph, everything)
     _check_determined(graph, everything, sorted(values.keys()))
@@ -116,7 +108,7 @@ def _check_linear(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> No
 
 def _check_determined(graph: gtsam.NonlinearFactorGraph, everything: gtsam.Values, own: list[int]) -> None:
     """The images determine the graph's variables: what remains are the new ones, by the new factors."""
-    if missing := [key for key in own if key not in keys_of(graph)]:
+    if missing := sorted(set(own) - keys_of(graph)):
         raise InputError(f"indeterminate: no factor names {name_of(missing[0])}")
     if not own:
         return

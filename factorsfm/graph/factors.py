@@ -198,6 +198,7 @@ def native_affine_noise(scale_sigma: float, shift_sigma: float) -> gtsam.noiseMo
 
 _PINNED_PX = 1e-3  # standard deviation of what does not count in a lens, pixels: less makes the system ill-conditioned
 KERNEL = 2.0  # Cauchy scale of measurements, standard deviations
+HELD = 1e-6  # standard deviation of what is constant
 
 
 def _robust(noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Robust:

@@ -9,18 +9,9 @@ import numpy as np
 from gtsam.symbol_shorthand import L, X
 from numpy.typing import NDArray
 
-from factorsfm.graph.added_factors import (
-    HELD,
-    AddedFactors,
-    MapValues,
-    error_of,
-    held_prior,
-    keys_of,
-    name_of,
-    part_of,
-    present_values,
-)
-from factorsfm.graph.factors import pose_from_camera
+from factorsfm.graph.added_factors import AddedFactors, MapValues, error_of, held_prior, present_values
+from factorsfm.graph.factors import HELD, pose_from_camera
+from factorsfm.graph.keys import keys_of, name_of, ordering_of, part_of
 
 Array = NDArray[np.float64]
 
@@ -57,18 +48,18 @@ class FactorsOnPoses:
         """Information (d, d) and gradient (d,) of that cost, d = 6 n + 3 p; poses are perturbed as in `factors`."""
         values = self._best(self._at(rotation, translation, points))
         linear = self._graph.linearize(values)
-        others = _ordering(self._own.keys())
-        for key in list(self._own.keys()):
-            size = self._own.dims()[key]
+        others = self._own.dims()
+        for key, size in others.items():
             linear.add(key, np.sqrt(_WEAK) * np.eye(size), np.zeros(size), gtsam.noiseModel.Unit.Create(size))
-        if others.size():
-            linear = linear.eliminatePartialMultifrontal(others)[1]
+        if others:
+            linear = linear.eliminatePartialMultifrontal(ordering_of(others))[1]
         size = int(self._columns[-1][-1]) + 1
         information, gradient = np.zeros((size, size)), np.zeros(size)
-        mine = [row for row in self._named if self._keys[row] in set(linear.keyVector())]
+        left = set(linear.keyVector())
+        mine = [row for row in self._named if self._keys[row] in left]
         if mine:
             columns = np.concatenate([self._columns[row] for row in mine])
-            hessian, right = linear.hessian(_ordering([self._keys[row] for row in mine]))
+            hessian, right = linear.hessian(ordering_of(self._keys[row] for row in mine))
             information[np.ix_(columns, columns)] = hessian
             gradient[columns] = -np.asarray(right).ravel()
         return information, gradient
@@ -78,10 +69,7 @@ class FactorsOnPoses:
         values = self._best(self._at(rotation, translation, points))
         factors = [self._graph.at(k) for k in range(self._graph.size())]
         return [
-            (
-                f"{type(factor).__name__} on {', '.join(map(name_of, factor.keys()))}",
-                error_of(factor, values),
-            )
+            (f"{type(factor).__name__} on {', '.join(map(name_of, factor.keys()))}", error_of(factor, values))
             for factor in factors
         ]
 
@@ -129,10 +117,3 @@ class FactorsOnPoses:
         values = gtsam.Values(fixed)
         values.insert(self._own)
         return values
-
-
-def _ordering(keys: Sequence[int]) -> gtsam.Ordering:
-    ordering = gtsam.Ordering()
-    for key in keys:
-        ordering.push_back(key)
-    return ordering

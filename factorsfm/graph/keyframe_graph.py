@@ -87,9 +87,10 @@ class KeyframeGraph:
                 if not reason:
                     self._live, solved = _with_open_lens(live, solved)
                     covariance = self._live.covariances(solved)
+                    if not added.numbers:
+                        return UpdateResult(True, "committed", solved, covariance)
                     estimate = self._live.estimate()
-                    misfit = misfit_of(added, estimate)
-                    added = added.with_values(estimate)
+                    misfit, added = misfit_of(added, estimate), added.with_values(estimate)
                     return UpdateResult(True, "committed", solved, covariance, added=added, misfit=misfit)
                 break
             except Exception as error:  # gtsam raises several types; any of them leaves the trial unusable

@@ -9,6 +9,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.graph.keys import ordering_of
+
 Array = NDArray[np.float64]
 
 
@@ -28,10 +30,7 @@ class LinearSystem:
     def of(cls, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, first: Sequence[int] = ()) -> LinearSystem:
         """Linearise at some values; the variables `first` have the first columns."""
         keys = [*first, *sorted(set(graph.keyVector()) - set(first))]
-        ordering = gtsam.Ordering()
-        for key in keys:
-            ordering.push_back(key)
         dimension = values.dims()
         ends = np.cumsum([dimension[key] for key in keys]).tolist()
         columns = {key: slice(end - dimension[key], end) for key, end in zip(keys, ends, strict=True)}
-        return cls(*graph.linearize(values).jacobian(ordering), columns)
+        return cls(*graph.linearize(values).jacobian(ordering_of(keys)), columns)

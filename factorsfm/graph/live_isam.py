@@ -11,9 +11,10 @@ import numpy as np
 from gtsam.symbol_shorthand import A, K, L, T, X
 from numpy.typing import NDArray
 
-from factorsfm.graph.added_factors import HELD, AddedFactors, held_prior, part_of
+from factorsfm.graph.added_factors import AddedFactors, held_prior
 from factorsfm.graph.changes import Changes
 from factorsfm.graph.factors import (
+    HELD,
     affine_of_native,
     affine_prior,
     camera_from_pose,
@@ -31,6 +32,7 @@ from factorsfm.graph.factors import (
     projection_factor,
     virtual_offset,
 )
+from factorsfm.graph.keys import part_of
 from factorsfm.graph.slots import Slots
 from factorsfm.graph.window import Window
 
@@ -108,12 +110,17 @@ class LiveIsam:
         self._observe(window, changes)
         self._measure_depths(window, changes)
         self._add(changes, added)
-        last = self._eliminated_last(changes)
-        result = self._isam.update(changes.graph, changes.values, changes.removed, last)
-        changes.settle(np.array(result.getNewFactorsIndices(), np.int64))
+        last = self._apply(changes)
         for _ in range(iterations - 1):
             self._isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), [], last)
         return self._solved(window)
+
+    def _apply(self, changes: Changes) -> gtsam.KeyGroupMap:
+        """One step of iSAM2, with what changes; what it eliminates last."""
+        last = self._eliminated_last(changes)
+        result = self._isam.update(changes.graph, changes.values, changes.removed, last)
+        changes.settle(np.array(result.getNewFactorsIndices(), np.int64))
+        return last
 
     def with_free_lens(self, window: Window) -> tuple[LiveIsam, Window] | None:
         """A copy in which the focal length is estimated, and the window with its values; None where it stays open.
@@ -125,24 +132,23 @@ class LiveIsam:
         live._free_lens()
         if live.focal_std() > 2.0 * _LENS_STD:
             return None
-        before, after = window.focal, live._solved(window).focal
+        before, after = window.focal, live._estimated_focal()
         if (steps := int(abs(np.log(after / before)) / _LENS_STEP)) > 0:
             live = self.copy()
             for focal in np.geomspace(before, after, steps + 2)[1:].tolist():
                 live._set_lens_prior(focal, HELD)
             live._free_lens()
-        solved = live._solved(window)
         for _ in range(_LENS_STEPS):
-            before = solved.focal
+            before = live._estimated_focal()
             live._free_lens()
-            solved = live._solved(window)
-            if abs(solved.focal / before - 1.0) < _LENS_TOLERANCE:
+            if abs(live._estimated_focal() / before - 1.0) < _LENS_TOLERANCE:
                 break
+        solved = live._solved(window)
         return (live, solved) if live.focal_std() < _LENS_STD else None
 
     def _free_lens(self) -> None:
         self.free_lens = True
-        focal = self._isam.calculateEstimate().atCal3_S2(K(0)).fx()
+        focal = self._estimated_focal()
         self._set_lens_prior(focal, _FREE_LENS * focal)
 
     def _set_lens_prior(self, focal: float, sigma: float) -> None:
@@ -150,8 +156,10 @@ class LiveIsam:
         key, changes = K(0), Changes()
         changes.removed.append(self._priors[key])
         changes.add([lens_prior(key, focal, sigma)], partial(self._note_prior, key))
-        result = self._isam.update(changes.graph, changes.values, changes.removed, self._eliminated_last(changes))
-        changes.settle(np.array(result.getNewFactorsIndices(), np.int64))
+        self._apply(changes)
+
+    def _estimated_focal(self) -> float:
+        return float(self.estimate().atCal3_S2(K(0)).fx())
 
     def _eliminated_last(self, changes: Changes) -> gtsam.KeyGroupMap:
         """Poses and affines, after the landmarks.
@@ -217,13 +225,11 @@ class LiveIsam:
                 held.insert_or_assign(X(int(window.keyframes[row])), pose)
         for key in [key for key in list(held.keys()) if key not in self._held]:
             self._held.add(key)
-            prior = held_prior(key, held)
             if key in self._priors:  # it was free before
                 changes.removed.append(self._priors[key])
-                changes.add([prior], partial(self._note_prior, key))
             else:
                 changes.values.insert(part_of(held, [key]))
-                changes.add([prior], partial(self._note_prior, key))
+            changes.add([held_prior(key, held)], partial(self._note_prior, key))
 
     def _add(self, changes: Changes, added: AddedFactors) -> None:
         """New factors of the caller, and the variables of their own."""
@@ -339,7 +345,7 @@ class LiveIsam:
     # --- values ---------------------------------------------------------------------------------------------------
 
     def _solved(self, window: Window) -> Window:
-        estimate = self._isam.calculateEstimate()
+        estimate = self.estimate()
         rotation, translation = window.rotation.copy(), window.translation.copy()
         for row in np.flatnonzero(~window.constant).tolist():
             rotation[row], translation[row] = camera_from_pose(estimate.atPose3(X(int(window.keyframes[row]))))

@@ -8,7 +8,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.graph.added_factors import AddedFactors, MapValues, letter_of, present_values
+from factorsfm.graph.added_factors import AddedFactors, MapValues, present_values
+from factorsfm.graph.keys import letter_of
 from factorsfm.graph.linear_system import LinearSystem
 
 Array = NDArray[np.float64]
@@ -27,8 +28,9 @@ def unit_of_length(added: AddedFactors, contents: MapValues) -> tuple[float, flo
     Args:
         contents: of the map.
     """
-    present = present_values(added.named, contents)
-    if len(list(present.keys())) < len(added.named):
+    named = added.named
+    present = present_values(named, contents)
+    if present.size() < len(named):
         return 1.0, np.inf
     graph, own, unit, std = added.graph(), added.values(), 1.0, np.inf
     for _ in range(_STEPS):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from factorsfm.graph.added_factors import NOTHING_ADDED, AddedFactors
@@ -51,11 +51,11 @@ class Additions:
 
     def present(self) -> AddedFactors:
         """What is active, and what waits."""
-        return _joined([self.active, *self.offered])
+        return AddedFactors.joined([self.active, *self.offered])
 
     def everything(self) -> AddedFactors:
         """All factors, as they were given, those included that wait."""
-        return _joined([*self.taken, *self.offered])
+        return AddedFactors.joined([*self.taken, *self.offered])
 
     def follow(self, update: MapUpdate) -> str:
         """Take over what an update made of the factors; a sentence where that is out of the ordinary."""
@@ -77,10 +77,3 @@ class Additions:
             said.append(f"of the factors added, {update.misfit} after the update; {where}")
             logger.warning(said[-1])
         return "; ".join(said)
-
-
-def _joined(batches: Sequence[AddedFactors]) -> AddedFactors:
-    added = NOTHING_ADDED
-    for batch in batches:
-        added = added.joined(batch)
-    return added

@@ -15,7 +15,7 @@ from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import ErrorModel, Free
 from factorsfm.adjustment.state import State
-from factorsfm.graph.added_factors import on_window
+from factorsfm.graph.added_factors import AddedFactors, on_window
 from factorsfm.graph.keyframe_graph import KeyframeGraph, UpdateResult
 from factorsfm.graph.live_isam import YOUNG
 from factorsfm.graph.unit_of_length import unit_of_length
@@ -66,9 +66,7 @@ def update_map(copy: MapCopy, graph: KeyframeGraph) -> MapUpdate:
 
 def _with_offered(copy: MapCopy) -> MapCopy:
     """The map with all that is offered, in the unit of length that the factors determine."""
-    added = copy.added
-    for offered in copy.offered:
-        added = added.joined(offered)
+    added = AddedFactors.joined([copy.added, *copy.offered])
     unit, std = unit_of_length(added, MapContents(copy.keyframes, copy.points))
     if not copy.offered or abs(np.log(unit)) < max(_SIGNIFICANT * std, _LEAST_CHANGE):
         unit = 1.0
@@ -76,6 +74,7 @@ def _with_offered(copy: MapCopy) -> MapCopy:
 
 
 def _extended(copy: MapCopy, graph: KeyframeGraph) -> MapUpdate:
+    """`update_map` with the factors that the copy has."""
     o, newest = copy.options, copy.newest
     position, depth = newest.tracks.position, newest.tracks.depth
     if o.graph_depth and len(copy.keyframes) <= YOUNG_KEYFRAMES and (reason := inconsistency(copy.keyframes)):

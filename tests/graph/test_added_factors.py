@@ -6,10 +6,11 @@ import pytest
 from gtsam.symbol_shorthand import A, B, L, P, V, X
 
 from factorsfm import InputError
-from factorsfm.graph.added_factors import HELD, NOTHING_ADDED, AddedFactors, condensed, held_prior, part_of
+from factorsfm.graph.added_factors import NOTHING_ADDED, AddedFactors, condensed, held_prior
 from factorsfm.graph.factor_checks import checked_factors
-from factorsfm.graph.factors import camera_from_pose
+from factorsfm.graph.factors import HELD, camera_from_pose
 from factorsfm.graph.factors_on_poses import FactorsOnPoses
+from factorsfm.graph.keys import part_of
 from factorsfm.graph.unit_of_length import unit_of_length
 
 FRAMES = 6
