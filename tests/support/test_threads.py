@@ -3,10 +3,11 @@
 import gc
 import subprocess
 import sys
+from weakref import WeakSet
 
 import cv2
 import pytest
-from threadpoolctl import threadpool_info
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from factorsfm.support.threads import OneThreadEach
 
@@ -33,12 +34,14 @@ def threads() -> tuple[int, list[int]]:
 
 
 @pytest.fixture(autouse=True)
-def _several_threads():
-    gc.collect()
-    OneThreadEach().close()  # gives back what a stream that another test has forgotten unclosed still holds
+def _several_threads(monkeypatch):
+    """Three threads each, and nobody who holds them: streams of other tests may still be open."""
+    monkeypatch.setattr(OneThreadEach, "_open", WeakSet())
+    monkeypatch.setattr(OneThreadEach, "_before", None)
     before = cv2.getNumThreads()
     cv2.setNumThreads(3)
-    yield
+    with threadpool_limits(3, "blas"):
+        yield
     cv2.setNumThreads(before)
 
 
