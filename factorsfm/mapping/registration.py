@@ -19,6 +19,10 @@ Array = NDArray[np.float64]
 
 _KERNEL = 2.0  # Cauchy scale in standard deviations
 _ALIGN_STEPS = 20  # at most
+_NARROWINGS, _SETTLED = (
+    10,
+    0.95,
+)  # of the kernel, at most; ratio of the spread to that before, above which it is the last
 _ROUGHLY, _FULLY = 1e-3, 1e-6  # relative decrease of the cost with which the alignment ends
 _BEHIND = 1e3  # residual of a point behind the camera, standard deviations
 _DEPTH_FLOOR = 0.03  # smallest believable relative error of a depth network
@@ -98,6 +102,11 @@ def _typical(error: Array) -> float:
     return 1.39 * float(np.partition(error, rank)[rank])
 
 
+def inlier_threshold(error: Array, inlier_px: float) -> float:
+    """Error (pixels) up to which an observation is an inlier among these: wider on a map that is not yet exact."""
+    return max(inlier_px, min(4.0 * _typical(error), 8.0 * inlier_px))
+
+
 def _align(
     points: Array,
     observed: Array,
@@ -150,14 +159,21 @@ def _refine(
     sigma: float,
     inlier_px: float,
 ) -> Registration:
-    """Robust pose; the kernel follows the spread of the residuals, since a young map is not yet exact."""
+    """Robust pose; the kernel follows the spread of the residuals, since a young map is not yet exact.
+
+    From far away it is wide, and lets what moves by itself draw the pose; so it narrows until the spread settles.
+    """
     error = _residuals(points, observed, rotation, translation, focal)
-    information = np.eye(6)
-    for tolerance in (_ROUGHLY, _FULLY):
-        spread = min(max(sigma, _typical(error)), 100.0 * sigma)
+    information, spread, settled = np.eye(6), np.inf, False
+    for _ in range(_NARROWINGS):
+        before, spread = spread, min(max(sigma, _typical(error)), 100.0 * sigma)
+        settled = spread == sigma or spread > _SETTLED * before
+        tolerance = _FULLY if settled else _ROUGHLY
         rotation, translation, information = _align(points, observed, rotation, translation, focal, spread, tolerance)
         error = _residuals(points, observed, rotation, translation, focal)
-    threshold = max(inlier_px, min(4.0 * _typical(error), 8.0 * inlier_px))
+        if settled:
+            break
+    threshold = inlier_threshold(error, inlier_px)
     inliers = error < threshold
     typical = float(np.median(error[inliers])) if inliers.any() else float("inf")
     covariance = np.asarray(np.linalg.inv(information + 1e-9 * np.diag(information.diagonal() + 1e-12)), np.float64)

@@ -51,6 +51,17 @@ def test_exact_observations_give_the_exact_pose(start, planar):
     assert result.affine is None
 
 
+@pytest.mark.parametrize("share", [0.2, 0.4])
+def test_what_moves_by_itself_does_not_draw_the_pose(share):
+    """From afar the kernel is wide, and its first minimum lies between the scene and what moves in it."""
+    points, observed = view(400, noise_px=0.15)
+    moves = observed[:, 0] < np.quantile(observed[:, 0], share)
+    observed[moves] += [9.0 / SETTINGS["focal"], 0.0]
+    result = register_image(points, observed, *near(), **SETTINGS)
+    np.testing.assert_array_equal(result.inliers, ~moves)
+    assert_pose(result, angle_rad=2e-4, distance=1e-3)
+
+
 @pytest.mark.parametrize("start", [near, far])
 @pytest.mark.parametrize("share", [0.1, 0.35])
 def test_outliers_are_found(start, share):
