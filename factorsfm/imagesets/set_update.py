@@ -45,7 +45,7 @@ def update_set(copy: MapCopy, graph: KeyframeGraph, shared: Index, held: Mask) -
         return MapUpdate(newest.position, None, False, result.reason), np.inf
     update = judged(copy, images, result)
     if len(others) and not constant.any():  # else the map as a whole stays; what is left is for the adjustment of all
-        update = solve_alone(copy, images, update, others, DepthGuidance(copy.options, copy.points))
+        update = solve_alone(copy, images, update, others, DepthGuidance(copy.options, copy.points), others[:0])
     return update, _worst_error(result.window)
 
 

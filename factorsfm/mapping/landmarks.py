@@ -109,9 +109,18 @@ def _spread(xy: Array, taken: NDArray[np.bool_], candidates: NDArray[np.intp], c
 
 
 def solve_alone(
-    copy: MapCopy, images: list[MappedImage], update: MapUpdate, ids: Index, guidance: DepthGuidance
+    copy: MapCopy,
+    images: list[MappedImage],
+    update: MapUpdate,
+    ids: Index,
+    guidance: DepthGuidance,
+    contradicting: Index,
 ) -> MapUpdate:
-    """The update with further points, each solved alone with the poses of the update."""
+    """The update with further points, each solved alone with the poses of the update.
+
+    Args:
+        ids: tracks (ascending); contradicting: those that did not fit before, and must now fit as inliers do.
+    """
     moved = [replace(image) for image in images]
     for image in moved:
         position = image.tracks.position
@@ -127,7 +136,8 @@ def solve_alone(
     )  # fmt: skip
     state = alone.solve(_ALONE_ITERATIONS)
     errors = np.sqrt(alone.observations.mean_by_point(alone.reprojection_errors() ** 2))
-    good = (state.inverse_distance > _FARTHEST) & (errors < _GROSS * copy.options.inlier_px)
+    limit = np.where(np.isin(ids, contradicting), 1.0, _GROSS) * copy.options.inlier_px
+    good = (state.inverse_distance > _FARTHEST) & (errors < limit)
     every, points = np.concatenate([update.ids, ids[good]]), np.concatenate([update.points, state.points[good]])
     order = np.argsort(every)
     return replace(update, ids=every[order], points=points[order], removed=np.union1d(update.removed, ids[~good]))

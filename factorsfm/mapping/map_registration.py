@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from factorsfm.adjustment.residuals import camera_points
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.mapping.point_map import PointMap
-from factorsfm.mapping.registration import Registration, register_image
+from factorsfm.mapping.registration import Registration, inlier_threshold, register_image
 from factorsfm.support.options import MapperOptions
 from factorsfm.support.status import FrameStatus
 
@@ -89,6 +89,26 @@ def _needed_inliers(near: MappedImage, threshold: float, least: int) -> int:
     new_area = max(0.0, 1.0 - (near.threshold / threshold) ** 2)
     most = max(least, _CONSENSUS * near.inliers)
     return math.ceil(least + new_area**2 * (most - least))
+
+
+def fits_pose(
+    image: MappedImage, ids: Index, points: PointMap, focal: float, options: MapperOptions
+) -> NDArray[np.bool_]:
+    """(n,) which mapped tracks (ascending) do not contradict the pose of an image: inliers, and what it does not see.
+
+    Where hardly any is an inlier, the pose is wrong, and nothing contradicts it.
+
+    Args:
+        image: sees some of them; focal: pixels.
+    """
+    seen, tracks = np.isin(ids, image.tracks.ids), image.tracks
+    q = camera_points(*image.pose, points.at(ids[seen]), np.ones(int(seen.sum())))
+    z = np.where(q[:, 2] > 0.0, q[:, 2], 1e-9)
+    error = focal * np.linalg.norm(q[:, :2] / z[:, None] - tracks.xy[np.isin(tracks.ids, ids)], axis=1)
+    inliers = error < inlier_threshold(error, options.inlier_px)
+    fits = np.ones(len(ids), bool)
+    fits[seen] = inliers | (inliers.sum() < options.min_inliers)
+    return fits
 
 
 def register_by_corners(

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
+from factorsfm.adjustment.gather import gather
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import ErrorModel, Free
 from factorsfm.adjustment.state import State
@@ -25,6 +26,7 @@ from factorsfm.mapping.graph_window import choose_landmarks, choose_window, meas
 from factorsfm.mapping.landmarks import add_landmarks, mapped_landmarks, solve_alone
 from factorsfm.mapping.map_contents import MapContents
 from factorsfm.mapping.map_copy import MapCopy, MapUpdate
+from factorsfm.mapping.map_registration import fits_pose
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.mapping.prior_check import inconsistency
 from factorsfm.mapping.registration import register_image
@@ -91,7 +93,10 @@ def _extended(copy: MapCopy, graph: KeyframeGraph) -> MapUpdate:
         return MapUpdate(position, depth, False, f"{seen} of {o.min_inliers} needed landmarks in the keyframe")
     # A young map has the shape that the prior guessed, and far to go; it is also cheap.
     iterations = max(o.graph_iterations, _YOUNG_ITERATIONS // len(copy.keyframes))
-    ids, others = choose_landmarks(images, ids, copy.added.tracks)
+    fits = fits_pose(newest, ids, copy.points, copy.focal, o)
+    contradicting, laid_over = ids[~fits], _resting_among(images, ids, ~fits, copy.focal)
+    ids, others = choose_landmarks(images, ids[fits], copy.added.tracks)
+    others = np.union1d(others, np.setdiff1d(contradicting, laid_over))
     result = _solved(copy, graph, images, constant, ids, iterations)
     burn_ins = removed = _burn_ins(copy, images, constant, result.window)
     if len(burn_ins):
@@ -102,8 +107,9 @@ def _extended(copy: MapCopy, graph: KeyframeGraph) -> MapUpdate:
         return MapUpdate(position, depth, False, result.reason, mirrored=result.mirrored)
     update = judged(copy, images, result)
     if len(others):
-        update = solve_alone(copy, images, update, others, guidance)
-    return replace(update, removed=np.union1d(update.removed, removed), burn_ins=burn_ins) if len(burn_ins) else update
+        update = solve_alone(copy, images, update, others, guidance, contradicting)
+    removed = np.concatenate([update.removed, removed, laid_over])
+    return replace(update, removed=np.unique(removed), burn_ins=np.union1d(burn_ins, laid_over))
 
 
 def _solved(
@@ -136,6 +142,13 @@ def _adjustment(window: Window) -> BundleAdjustment:
     observations = Observations(window.frame, window.point, window.pixels)
     held = Free(held=~window.solved)
     return BundleAdjustment(state, observations, _SOLVER, ErrorModel(window.sigma), free=held)
+
+
+def _resting_among(images: list[MappedImage], ids: Index, suspects: NDArray[np.bool_], focal: float) -> Index:
+    """Those of the suspected tracks (a part of `ids`) that rest in the image while the others move."""
+    if not suspects.any():
+        return ids[:0]
+    return ids[suspects & resting(gather([image.tracks for image in images], ids, focal))]
 
 
 def _burn_ins(copy: MapCopy, images: list[MappedImage], constant: NDArray[np.bool_], window: Window) -> Index:

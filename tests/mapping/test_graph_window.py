@@ -101,7 +101,7 @@ def test_points_that_are_solved_alone_follow_the_new_poses(guided):
     )
     copy = MapCopy(images, map_of(near.points), OPTIONS, problem.focal)
     before = [image.pose for image in images]
-    moved = solve_alone(copy, images, update, outside, DepthGuidance(OPTIONS, copy.points))
+    moved = solve_alone(copy, images, update, outside, DepthGuidance(OPTIONS, copy.points), outside[:0])
     np.testing.assert_array_equal(moved.ids, np.arange(n))
     np.testing.assert_array_equal(moved.points[inside], problem.points[inside])
     np.testing.assert_array_equal(moved.removed, [1000])
@@ -115,18 +115,37 @@ def test_points_that_are_solved_alone_follow_the_new_poses(guided):
     np.testing.assert_array_equal(copy.points.at(outside), near.points[outside])
 
 
-def test_a_point_that_holds_nowhere_is_removed_outside_of_the_graph_too():
+@pytest.mark.parametrize(("contradicting", "kept"), [(0, 2), (10, 1)])
+def test_a_point_that_holds_nowhere_is_removed_outside_of_the_graph_too(contradicting, kept):
+    """One that did not fit before has to fit better than others."""
     problem, _ = handheld()
     images = mapped_images(problem, problem.truth)
     rng, n = np.random.default_rng(0), len(problem.points)
-    for image in images:
+    for k, image in enumerate(images):
         image.tracks.pixels[n - 1] = [320, 180] + problem.focal * rng.uniform(-0.3, 0.3, 2)
+        image.tracks.pixels[n - 2] += [0.0, 6.0 * (-1) ** k]
     copy = MapCopy(images, map_of(problem.points), OPTIONS, problem.focal)
     update = solve_alone(
-        copy, images, MapUpdate(5, None, True, "committed"), np.arange(n - 10, n), DepthGuidance(OPTIONS, copy.points)
-    )
-    np.testing.assert_array_equal(update.ids, np.arange(n - 10, n - 1))
-    np.testing.assert_array_equal(update.removed, [n - 1])
+        copy, images, MapUpdate(5, None, True, "committed"), np.arange(n - 10, n), DepthGuidance(OPTIONS, copy.points),
+        np.arange(n - contradicting, n),
+    )  # fmt: skip
+    np.testing.assert_array_equal(update.ids, np.arange(n - 10, n - 3 + kept))
+    np.testing.assert_array_equal(update.removed, np.arange(n - 3 + kept, n))
+
+
+def test_what_contradicts_the_pose_of_the_new_keyframe_does_not_bend_the_map():
+    problem, _ = handheld(noise_px=0.05)
+    n = len(problem.points)
+    scene, walker = np.arange(n - 30), np.arange(n - 30, n)
+    images = mapped_images(problem, problem.truth)
+    for k, image in enumerate(images):
+        image.tracks.pixels[walker] += [4.0 * k, 0.0]
+    copy = MapCopy(images, map_of(problem.points), OPTIONS, problem.focal)
+    update = update_map(copy, KeyframeGraph())
+    np.testing.assert_array_equal(update.ids, scene)
+    np.testing.assert_array_equal(update.removed, walker)
+    turn = [angles_between(r[None], problem.truth.rotation[k][None])[0] for k, (r, _) in update.poses.items()]
+    assert 1e-6 < max(turn) < 1e-4
 
 
 def test_an_update_brings_the_points_outside_of_the_graph_along(monkeypatch):

@@ -250,10 +250,16 @@ def test_a_track_of_one_keyframe_is_no_point_yet():
 
 def test_an_observation_that_is_elsewhere_takes_no_point_away():
     problem, images, points = handheld()
-    images[5].tracks.pixels[[3, 17], 0] += 25
-    images[2].tracks.pixels[8, 0] += 25
+    images[2].tracks.pixels[[3, 8, 17], 0] += 25
     update = update_map(copy_of(problem, images, map_of(points)), KeyframeGraph())
     assert len(update.removed) == 0  # the other views hold the points
+
+
+def test_a_track_that_leaves_its_point_takes_it_away():
+    problem, images, points = handheld()
+    images[5].tracks.pixels[[3, 17], 0] += 25
+    update = update_map(copy_of(problem, images, map_of(points)), KeyframeGraph())
+    np.testing.assert_array_equal(update.removed, [3, 17])
 
 
 def test_a_point_that_holds_nowhere_is_removed():
