@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from factorsfm.support.context import Closing
 from factorsfm.support.options import TrackerOptions
 from factorsfm.tracks.corners import new_corners
-from factorsfm.tracks.frame_flow import FrameFlow
+from factorsfm.tracks.frame_flow import FrameFlow, robust_fit
 from factorsfm.tracks.grey import GreyFrame, match_exposure
 from factorsfm.tracks.local_motion import LocalMotion
 from factorsfm.tracks.patches import BirthPatches
@@ -39,6 +39,7 @@ Image = NDArray[np.uint8]
 _BLANK_SHARE = 0.2  # texture over that of the previous frame, below which a frame is black or a flash
 _CHECK_INTERVAL = 2  # frames: the alignment of every track is checked backward in one of them
 _SURPRISE_PX, _SURPRISE_RATIO = 0.5, 3.0  # largest distance from the prediction, and the same over the median distance
+_OTHERWISE_PX, _OTHERWISE_RATIO = 2.0, 5.0  # least distance from the motion of the image, and the same over the median
 _MAJORITY = 0.5  # share of the tracks that are found; with fewer, the prediction is wrong
 _AWAY_FRAMES = 48  # after which a track that left the view may be revived: only a camera that returns sees it again
 _REVIVAL_REACH = 2.0  # times that of a re-alignment: the place of a revived track is less certain
@@ -207,9 +208,14 @@ class FlowTracker(Closing):
 
     def _move_patches(self, old: Array, new: Array, found: Flags, shape: tuple[int, ...]) -> None:
         """Update the maps of the patches by the local motion of the found tracks."""
-        self._motion = LocalMotion(old[found], new[found], shape)
         linear = np.tile(np.eye(2, dtype=np.float32), (len(old), 1, 1))
-        linear[found] = self._motion.linear(old[found])
+        rows = np.nonzero(found)[0]
+        odd = _moves_otherwise(old[rows], new[rows], max(shape))
+        with_image, otherwise = rows[~odd], rows[odd]
+        self._motion = LocalMotion(old[with_image], new[with_image], shape)
+        linear[with_image] = self._motion.linear(old[with_image])
+        if len(otherwise):
+            linear[otherwise] = LocalMotion(old[otherwise], new[otherwise], shape).linear(old[otherwise])
         self._tracks.patches.move(linear)
 
     def _end(self, found: Flags, place: Array, shape: tuple[int, ...], mask: Flags | None) -> None:
@@ -251,6 +257,19 @@ class FlowTracker(Closing):
     def _local_velocity(self, xy: Array) -> Array:
         """(n, 2) velocity of points that were not followed into this frame: that of their neighbours."""
         return np.zeros_like(xy) if self._motion is None else self._motion.at(xy)
+
+
+def _moves_otherwise(old: Array, new: Array, size: int) -> Flags:
+    """(n,) which tracks move unlike the image as a whole: their motion says nothing of the patches beside them.
+
+    Args:
+        old, new: (n, 2) pixels in two frames; size: of the image, pixels.
+    """
+    if not len(old):
+        return np.zeros(0, bool)
+    design = np.column_stack([np.ones(len(old)), old / size])
+    error = np.linalg.norm(new - old - design @ robust_fit(design, new - old), axis=1)
+    return np.asarray(error > max(_OTHERWISE_PX, _OTHERWISE_RATIO * float(np.median(error))))
 
 
 def _inside(xy: NDArray[np.floating[Any]], shape: tuple[int, ...], border: int) -> Flags:

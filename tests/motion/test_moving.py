@@ -11,6 +11,7 @@ from factorsfm.adjustment.problem import ErrorModel
 from factorsfm.motion.moving import bounded_cost, standing_out
 from factorsfm.polish.camera_starts import best_solution
 from factorsfm.support.options import Options, PolishOptions
+from factorsfm.tracks.flow import _moves_otherwise
 from tests.estimation_problems import angles_between, centers, in_unit_of, make_problem, perturbed
 
 WALKER = 24
@@ -116,3 +117,11 @@ def test_what_is_left_out_costs_as_much_as_what_stands_out():
     assert costs[1] - bounded_cost(part, 0.1, len(part.observations.frame)) == pytest.approx(
         2.0 * np.log1p(25.0) * WALKER * problem.frames
     )
+
+
+def test_the_patches_of_the_scene_do_not_follow_a_walker():
+    old = np.random.default_rng(0).uniform(0.0, [320.0, 180.0], (200, 2)).astype(np.float32)
+    walks = np.abs(old[:, 0] - 160.0) < 25.0
+    new = old + np.where(walks[:, None], [9.0, 0.0], [1.0, 0.5]).astype(np.float32) + 0.002 * old
+    np.testing.assert_array_equal(_moves_otherwise(old, new, 320), walks)
+    assert not _moves_otherwise(old[~walks], new[~walks], 320).any()
