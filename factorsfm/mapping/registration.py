@@ -107,6 +107,34 @@ def inlier_threshold(error: Array, inlier_px: float) -> float:
     return max(inlier_px, min(4.0 * _typical(error), 8.0 * inlier_px))
 
 
+def _turned(points: Array, observed: Array, rotation: Array, translation: Array, focal: float, sigma: float) -> Array:
+    """Rotation with which most points are seen where they are, the camera's centre held.
+
+    From one image to the next a camera turns by more pixels than it translates. A person before the scene is taken for
+    parallax more easily than for a turn.
+    """
+    rows, center, spread = np.ascontiguousarray(points.T), -rotation.T @ translation, np.inf
+    q, seen = rotation @ (rows - center[:, None]), focal * observed.T
+    for _ in range(_NARROWINGS):
+        before = spread
+        front = q[2] > 1e-6
+        prediction, by_pose = projection_by_pose(np.where(front, q, 1.0), focal)
+        residual = prediction - seen
+        residual[:, ~front] = _BEHIND
+        error = np.hypot(*residual)
+        spread = min(max(sigma, _typical(error)), 100.0 * sigma)
+        if spread > _SETTLED * before:
+            break
+        weight = front / (1.0 + (error / (_KERNEL * spread)) ** 2)
+        jacobian = by_pose[:3].reshape(3, -1)
+        weighted = (by_pose[:3] * weight).reshape(3, -1)
+        normal = weighted @ jacobian.T
+        step = np.linalg.solve(normal + 1e-9 * np.trace(normal) * np.eye(3), weighted @ residual.ravel())
+        turn = cv2.Rodrigues(step)[0]
+        rotation, q = turn @ rotation, turn @ q
+    return rotation
+
+
 def _align(
     points: Array,
     observed: Array,
@@ -163,6 +191,8 @@ def _refine(
 
     From far away it is wide, and lets what moves by itself draw the pose; so it narrows until the spread settles.
     """
+    turned = _turned(points, observed, rotation, translation, focal, sigma)
+    rotation, translation = turned, turned @ rotation.T @ translation
     error = _residuals(points, observed, rotation, translation, focal)
     information, spread, settled = np.eye(6), np.inf, False
     for _ in range(_NARROWINGS):
