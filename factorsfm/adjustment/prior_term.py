@@ -29,7 +29,7 @@ Index = NDArray[np.int64]
 
 logger = logging.getLogger(__name__)
 
-_LEAST_CORRELATION = 0.1  # with the reconstructed inverse depth; a prior below this is not used
+LEAST_CORRELATION = 0.1  # with the reconstructed inverse depth; a prior below this is not used
 
 
 @dataclass(slots=True)
@@ -70,7 +70,7 @@ def weigh_prior(
     images: Sequence[ImageTracks],
     inflation: float,
 ) -> WeighedPrior | None:
-    """Measure the error model of the prior on this shot; None without a prior, or where it contradicts the geometry."""
+    """Measure the error model of the prior on this shot; None without a prior."""
     values = prior_values(images, observations, tracks)
     if values is None:
         return None
@@ -94,8 +94,6 @@ def weigh_prior(
         "prior: smooth error %.2f, local %.3f of the median inverse depth, correlation %.2f; inflation %.1f",
         weight.smooth, weight.local, weight.correlation, inflation,
     )  # fmt: skip
-    if weight.correlation < _LEAST_CORRELATION:
-        return None
     return WeighedPrior(weight, values.rows, scale, shift, inflation)
 
 

@@ -17,7 +17,7 @@ from factorsfm.batch.plan import Job, Video
 from factorsfm.export.writing import complete_file
 from factorsfm.report.document import document, packaged
 from factorsfm.report.result_folder import check_directory
-from factorsfm.report.wording import grade_of
+from factorsfm.result.verdict import Grade
 from factorsfm.support.errors import InputError
 from factorsfm.support.json_reading import read_json, typed
 from factorsfm.support.json_text import json_text
@@ -43,7 +43,7 @@ class Entry:
     folder: str
     frames: tuple[int, int]
     reconstructed: bool
-    grade: str
+    grade: Grade
     verdict: str
     registered: int
     parallax: float
@@ -61,7 +61,7 @@ class Entry:
             folder=job.folder.relative_to(output.absolute()).as_posix(),
             frames=(job.frames.start, job.frames.stop),
             reconstructed=done,
-            grade=grade_of(outcome.registered, outcome.frames, outcome.reprojection_error) if done else "Not solved",
+            grade=outcome.grade,
             verdict=outcome.verdict if done else outcome.reason.rstrip("."),
             registered=outcome.registered if done else 0,
             parallax=outcome.parallax,

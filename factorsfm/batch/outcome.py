@@ -13,6 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from factorsfm.result.verdict import Grade
 from factorsfm.support.errors import InputError
 from factorsfm.support.json_reading import read_json, typed
 
@@ -26,13 +27,13 @@ class Outcome:
     """The summary of a shot, with `verdict` if it is reconstructed and `reason` otherwise."""
 
     reconstructed: bool
+    grade: Grade
     frames: int
     registered: int
     seconds: dict[str, float]
     verdict: str = ""
     reason: str = ""
     parallax: float = math.nan
-    reprojection_error: float = math.nan
     options: dict[str, Any] = field(default_factory=dict)
 
 

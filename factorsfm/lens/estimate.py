@@ -72,6 +72,8 @@ def estimate_lens(
     options: Options,
     focal_prior: FocalPrior | None = None,
     first_focal: tuple[Array, float] | None = None,
+    *,
+    moves: bool = True,
 ) -> tuple[BundleAdjustment, LensEstimate]:
     """The lens where the shot determines it, else the first guess; and the cameras solved with it.
 
@@ -79,6 +81,8 @@ def estimate_lens(
         adjustment: converged with the guess; focal_prior: of the focal lengths, None for none.
         first_focal: (g,) focal lengths as they were known first, pixels, and their relative standard deviation; None:
             those of the guess, which are kept where the shot determines none.
+        moves: whether the camera may; one that only turns has found its focal length already (`turning_camera`), and
+            a translation would only bend it.
     """
     guess, width = Lens.of(adjustment.state), _width(adjustment)
     straight_sigmas, sigmas = _prior_sigmas(guess, options.lens, width)
@@ -86,13 +90,13 @@ def estimate_lens(
     if held:
         focal_prior = FocalPrior(np.log(guess.focal), np.eye(len(guess.focal)) / _HELD_STD**2)
     o = replace(options.polish, tolerance=_TOLERANCE)
-    first, bent = (guess, None) if held else _searched(adjustment, o, sigmas)
+    first, bent = (guess, None) if held or not moves else _searched(adjustment, o, sigmas)
     solver = LensSolver(adjustment.observations, o, focal_prior)
     start = _seen_through(adjustment.state, first)
-    best = straight = _straight_solution(solver, start, adjustment.sigma, straight_sigmas)
+    best = straight = _straight_solution(solver, start, adjustment.sigma, straight_sigmas, moves=moves)
     if sigmas[DISTORTION].any():
         # Strong distortion moves the valley of the focal length: a start without any does not lead there.
-        starts = [] if bent is None else [(_seen_through(adjustment.state, bent), adjustment.sigma, True)]
+        starts = [] if bent is None else [(_seen_through(adjustment.state, bent), adjustment.sigma, moves)]
         starts.append((straight.adjustment.state, straight.adjustment.sigma, straight.moves))
         free = _with_free_shape(solver, starts, sigmas)
         if free is not None:
@@ -129,9 +133,9 @@ def _seen_through(state: State, lens: Lens) -> State:
     return replace(through(state, lens.focal), lens=lens.shape)
 
 
-def _straight_solution(solver: LensSolver, start: State, sigma: float, sigmas: Array) -> _Solution:
+def _straight_solution(solver: LensSolver, start: State, sigma: float, sigmas: Array, *, moves: bool) -> _Solution:
     """The solution without free distortion."""
-    adjustment, moves = solver.solved_as_it_moves(start, sigma, sigmas)
+    adjustment, moves = solver.solved_as_it_moves(start, sigma, sigmas, moves=moves)
     std, left_out, _ = lens_deviations(adjustment)
     known = _largest(std, left_out, len(start.log_focal)) < DETERMINED_FOCAL_STD
     return _Solution(adjustment, moves, std, left_out, known)
@@ -199,6 +203,9 @@ def _concluded(
     # In a long valley a standard deviation says little.
     counts = sound and float(best.std[: best.groups].max()) < GIVEN_FOCAL_STD
     focal, rough = _kept_focal(lens.focal, focal_std, first_focal, counts=bool(counts))
+    if not best.moves and sound and float(focal_std.max()) < first_focal[1]:
+        # Through another focal length, a camera that turns would seem to move.
+        focal, rough = lens.focal, True
     if not rough:
         shape_std = np.full(LENS_SIZE, np.nan)
     final = Lens(focal, lens.shape if rough else guess.shape)

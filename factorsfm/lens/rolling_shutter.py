@@ -154,14 +154,23 @@ def find_shutter(adjustment: BundleAdjustment, motion: Motion, options: Options)
     """
     if motion.kind is ShotKind.STATIC:
         return None
-    if motion.gain < _TURNING_GAIN:  # a camera that turns may seem to move, too, since its images are skewed
-        turning = _solved_with_readout(adjustment, motion.rotation_only, options, moves=False)
-        if turning is not None and translation_gain(turning, adjustment) < LEAST_GAIN:
-            return _believed(turning, adjustment.state)
+    if (turning := turns_before_shutter(adjustment, motion, options)) is not None:
+        return _believed(turning, adjustment.state)
     if motion.kind is ShotKind.ROTATION:
         return None
     moving = _solved_with_readout(adjustment, adjustment.state, options, moves=True)
     return None if moving is None else _believed(moving, adjustment.state)
+
+
+def turns_before_shutter(adjustment: BundleAdjustment, motion: Motion, options: Options) -> BundleAdjustment | None:
+    """The camera that turns before a rolling shutter, where that explains what seems to be a translation; else None.
+
+    The images of a camera that turns are skewed, and so it may seem to move, too.
+    """
+    if motion.gain >= _TURNING_GAIN:
+        return None
+    turning = _solved_with_readout(adjustment, motion.rotation_only, options, moves=False)
+    return turning if turning is not None and translation_gain(turning, adjustment) < LEAST_GAIN else None
 
 
 def _solved_with_readout(

@@ -33,7 +33,7 @@ def search_lens(
         sigmas: (6,) prior standard deviations of the shape around that of the solution; None: it is constant.
     """
     guess = Lens.of(adjustment.state)
-    state, few = _some_frames(adjustment.state, adjustment.observations)
+    state, few = some_frames(adjustment.state, adjustment.observations)
     options = replace(options, iterations=_SEARCH_ITERATIONS, tolerance=1e-3)
     known = Known(lens=None if sigmas is None else LensPrior(guess.shape, sigmas))
 
@@ -71,7 +71,7 @@ def search_lens(
     return Lens(factor * guess.focal, found.lens), cost
 
 
-def _some_frames(state: State, observations: Observations) -> tuple[State, Observations]:
+def some_frames(state: State, observations: Observations) -> tuple[State, Observations]:
     """Few frames, evenly spread, that of the world among them, and the points that two of them see."""
     count = len(state.rotation)
     frames = np.unique([*np.linspace(0, count - 1, min(count, _SEARCH_FRAMES)).astype(int), state.world])

@@ -21,6 +21,7 @@ _STATIC_SHARE = 0.004  # largest median displacement of the tracks of a static s
 # count as observed when they explain at least half as much again as noise. On tripod shots the gain is 0.05 to 0.15,
 # on the first ten frames of slow moves 1.5 and more.
 LEAST_GAIN = 0.5
+_CLOSE = 1.5  # factor on it between which the verdict is doubtful
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +38,11 @@ class Motion:
     displacement_px: float
     gain: float
     rotation_only: State
+
+    @property
+    def close(self) -> bool:
+        """Whether rotation and general motion are nearly as good readings of a camera that is not static."""
+        return self.kind is not ShotKind.STATIC and LEAST_GAIN / _CLOSE < self.gain < LEAST_GAIN * _CLOSE
 
 
 def displacement(observations: Observations, xy: Array) -> float:

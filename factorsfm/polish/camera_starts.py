@@ -13,6 +13,7 @@ from factorsfm.adjustment.noise import FIRST_SIGMA_PX, coordinate_sigma, image_c
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import ErrorModel, Free
 from factorsfm.adjustment.state import State
+from factorsfm.motion.at_rest import Rest
 from factorsfm.motion.burn_ins import contradicts, resting
 from factorsfm.motion.moving import SPOILT, bounded_cost, standing_out
 from factorsfm.support.options import Options, PolishOptions
@@ -37,11 +38,15 @@ class CameraSolution:
     Attributes:
         kept: which of the points it has; adjustment: converged over them; moving: how many are left out because they
             move by themselves.
+        turns: whether a camera that only turns explains them, through the lens that it has found.
+        rest: what rests in the image while other things move, None where nothing does.
     """
 
     kept: Index
     adjustment: BundleAdjustment
     moving: int = 0
+    turns: bool = False
+    rest: Rest | None = None
 
 
 def best_solution(start: State, few: Observations, options: Options) -> CameraSolution:
@@ -64,14 +69,14 @@ def best_solution(start: State, few: Observations, options: Options) -> CameraSo
     if best.sigma > options.polish.doubtful_px or best.error_inflation() > _DOUBTFUL_INFLATION:
         logger.info("the solution does not fit (%.2f px), trying other starts", best.sigma)
         for other in (start, _flat(start, few, options.polish)):
-            found = _better(found, _on_what_fits(other, few, options), few)
+            found = _better(found, on_what_fits(other, few, options), few)
         best = found.adjustment
-        mirrored = solution_from(_reversed(best.state), best.observations, options)
+        mirrored = solution_from(reversed_scene(best.state), best.observations, options)
         found = _better(found, replace(found, adjustment=mirrored), few)
     return replace(found, kept=kept[found.kept])
 
 
-def _on_what_fits(start: State, few: Observations, options: Options) -> CameraSolution:
+def on_what_fits(start: State, few: Observations, options: Options) -> CameraSolution:
     """Converged from a start on the points that its cameras explain: what does not fit might lead away from it."""
     points = BundleAdjustment(
         start, few, replace(options.polish, iterations=_POINT_ITERATIONS), ErrorModel(1.0), free=Free(cameras=False)
@@ -151,7 +156,7 @@ def in_front(part: State) -> State:
     return replace(part, translation=-part.translation, inverse_distance=-part.inverse_distance)
 
 
-def _reversed(part: State) -> State:
+def reversed_scene(part: State) -> State:
     """Near and far exchanged and the motion reversed: in a narrow view the images are almost the same."""
     center = float(np.median(part.inverse_distance))
     inverse = np.clip(2.0 * center - part.inverse_distance, 0.05 * center, 4.0 * center)

@@ -79,10 +79,10 @@ def polish(
     start, frames, left_out = _start(shot, options, named, progress)
     progress("polish: all tracks")
     adjustment, result = _solved(shot, start, frames, left_out, options.polish)
-    if control is not None and start.motion.kind is ShotKind.GENERAL:
+    if control is not None and start.core.motion.kind is ShotKind.GENERAL:
         progress("polish: control")
         _put_under_control(result, adjustment, control, shot)
-    if factors is not None and start.motion.kind is ShotKind.GENERAL:
+    if factors is not None and start.core.motion.kind is ShotKind.GENERAL:
         progress("polish: factors")
         _respect_factors(result, adjustment, factors, shot)
     if result.control is None and (control is not None or factors is not None):
@@ -164,9 +164,10 @@ def _solved(
     covariance = in_scene_unit(marginals, adjustment.state)
     result = Polished(
         frames, adjustment.state, start.tracks, start.observations, adjustment.reprojection_errors(), start.sigma,
-        *adjustment.observation_sigmas(), start.motion, *_pose_covariances(covariance, adjustment.state),
+        *adjustment.observation_sigmas(), start.core.motion, *_pose_covariances(covariance, adjustment.state),
         camera_observability(adjustment, marginals, covariance), marginals.inverse_distance_std(covariance),
-        left_out, prior, start.lens, start.shutter, moving=start.moving,
+        left_out, prior, start.core.lens, start.core.shutter, moving=start.core.moving, turns=start.core.turns,
+        rest=start.core.rest, contradiction=start.depths.correlation, reversible=start.depths.open,
     )  # fmt: skip
     result.describe_prior(adjustment, covariance)
     return adjustment, result
@@ -182,7 +183,7 @@ def _problem(
     shot: Shot, start: PolishStart, frames: list[int], options: PolishOptions
 ) -> tuple[BundleAdjustment, PriorPart | None]:
     """All tracks, with the prior where it takes part."""
-    moves, state = start.motion.kind is ShotKind.GENERAL, start.state.seen_from(0)
+    moves, state = start.core.motion.kind is ShotKind.GENERAL, start.state.seen_from(0)
     scale, wide, errors = start.sigma, float(np.sqrt(start.inflation)), None
     if options.observation_sigmas is None:
         state, errors = _with_track_errors(state, start, moves, options)
@@ -193,10 +194,10 @@ def _problem(
         ErrorModel(scale * wide, errors),
         replace(options, kernel=options.kernel / wide, tolerance=_TOLERANCE),
     )
-    if start.prior is None:
+    if start.depths.prior is None:
         return BundleAdjustment(state, start.observations, options, model, free=Free(translation=moves)), None
     return joint_problem(
-        state, start.observations, start.tracks, shot.tracks(frames), start.prior, model, options
+        state, start.observations, start.tracks, shot.tracks(frames), start.depths.prior, model, options
     )  # fmt: skip
 
 
@@ -241,6 +242,7 @@ def _fit_to_recorded_images(result: Polished, options: PolishOptions) -> None:
     weight = cauchy(result.errors[:, None] / result.sigma, options.kernel)[1]
     moves, model = result.motion.kind is ShotKind.GENERAL, ErrorModel(result.sigma)
     rolling = BundleAdjustment(result.state, result.observations, options, model).reprojection_vectors()
+    result.shutter_error = float(np.median(result.errors))
     state = replace(seen_at_once(result.state, result.observations, weight, moves=moves), world=-1)
     result.state, result.recorded = state.seen_from(0), True
     at_once = BundleAdjustment(result.state, result.observations, options, model)

@@ -14,6 +14,7 @@ from factorsfm.adjustment.state import State
 from factorsfm.control.fit import ControlFit
 from factorsfm.lens.lens import LensEstimate
 from factorsfm.lens.rolling_shutter import Shutter
+from factorsfm.motion.at_rest import Rest
 from factorsfm.motion.shot_kind import Motion
 from factorsfm.polish.observability import CameraObservability
 from factorsfm.support.similarity import Similarity
@@ -39,7 +40,12 @@ class Polished:
         shutter: a rolling shutter, None where the shot shows none; recorded: whether poses are those of cameras without
             one, fitted to the recorded images, see `Options.shutter`; rolled: (m, 2) where each observation is beside
             where such a camera would have it (pixels), None where they are not.
+        shutter_error: median reprojection error with the rolling shutter in the model (pixels); NaN where poses are not
+            `recorded`.
         moving: share of the longest tracks that move by themselves and are left out.
+        turns: whether a camera that only turns explains the tracks through a lens of its own, see `turning_reading`.
+        rest: what rests in the image while other things move, None where nothing does.
+        contradiction, reversible: see `NearAndFar.correlation` and `NearAndFar.open`.
         world_alignment: from this world to that of the control; control: its residuals. None without control.
         unused: "Control" or "Factors added", where there are some that could not take part.
     """
@@ -63,7 +69,12 @@ class Polished:
     shutter: Shutter | None = None
     recorded: bool = False
     rolled: Array | None = None
+    shutter_error: float = np.nan
     moving: float = 0.0
+    turns: bool = False
+    rest: Rest | None = None
+    contradiction: float | None = None
+    reversible: bool = False
     world_alignment: Similarity | None = None
     control: ControlFit | None = None
     unused: str = ""

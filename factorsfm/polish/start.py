@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.noise import FIRST_SIGMA_PX
 from factorsfm.adjustment.observations import Observations
-from factorsfm.adjustment.prior_term import WeighedPrior, weigh_prior
 from factorsfm.adjustment.problem import FocalPrior, Free
 from factorsfm.adjustment.state import State
 from factorsfm.lens.estimate import estimate_lens
@@ -19,9 +18,12 @@ from factorsfm.lens.lens import LensEstimate
 from factorsfm.lens.rolling_shutter import Shutter, find_shutter
 from factorsfm.lens.zoom import find_zoom
 from factorsfm.mapping.triangulation import Triangulation, triangulate
+from factorsfm.motion.at_rest import Rest
 from factorsfm.motion.shot_kind import Motion, classify_motion
 from factorsfm.polish.camera_starts import best_solution, core_tracks, solution_from
+from factorsfm.polish.near_and_far import NearAndFar, near_and_far
 from factorsfm.polish.shot import Shot
+from factorsfm.polish.simple_readings import turning_reading, unless_at_rest
 from factorsfm.support.options import Options, PolishOptions
 from factorsfm.support.status import ShotKind
 
@@ -30,6 +32,7 @@ Index = NDArray[np.int64]
 
 _TRIANGULATION_VIEWS = 10
 _MANY_TRACKS = 0.3  # of the largest number of tracks in a frame
+_MOSTLY_MOVING = 0.4  # of the core: a median of all points would say nothing of the others
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +42,7 @@ class PolishStart:
     Attributes:
         state: of cameras, lens and points; observations, tracks: that belong together.
         sigma: of the core tracks, pixels; inflation: of its square, since errors repeat themselves.
-        prior: with the weight it earns; lens, shutter, moving: see `Polished`.
+        depths: with the prior at the weight it earns; core: solved first.
     """
 
     state: State
@@ -47,20 +50,17 @@ class PolishStart:
     tracks: Index
     sigma: float
     inflation: float
-    motion: Motion
-    prior: WeighedPrior | None
-    lens: LensEstimate | None
-    shutter: Shutter | None
-    moving: float
+    depths: NearAndFar
+    core: Core
 
 
 @dataclass(frozen=True, slots=True)
-class _Core:
+class Core:
     """The cameras solved on the core tracks.
 
     Attributes:
         points: rows of the core among all points; adjustment: converged over them.
-        moving: see `Polished`.
+        moving, turns, rest: see `Polished`.
     """
 
     points: Index
@@ -69,6 +69,8 @@ class _Core:
     lens: LensEstimate | None
     shutter: Shutter | None
     moving: float
+    turns: bool
+    rest: Rest | None
 
 
 def polish_start(
@@ -86,25 +88,27 @@ def polish_start(
     """
     progress("polish: cameras")
     core = _solved_core(shot, frames, observations, tracks, options)
-    solved, motion = core.adjustment, core.motion
-    inflation = solved.error_inflation()
-    prior, part = None, motion.rotation_only
-    if motion.kind is ShotKind.GENERAL:
-        part = solved.state
-        if options.polish.depth:
-            prior = weigh_prior(solved, solved.observations, tracks[core.points], shot.tracks(frames), inflation)
+    inflation, general = core.adjustment.error_inflation(), core.motion.kind is ShotKind.GENERAL
+    depths = NearAndFar(core.adjustment)
+    if general:
+        depths = near_and_far(core.adjustment, tracks[core.points], shot.tracks(frames), inflation, options)
+        core = replace(core, adjustment=depths.adjustment)
 
     progress("polish: points")
+    part = core.adjustment.state if general else core.motion.rotation_only
     fitting = _with_fitting_tracks(part, core, observations, tracks, options.polish)
-    return PolishStart(*fitting, solved.sigma, inflation, motion, prior, core.lens, core.shutter, core.moving)
+    return PolishStart(*fitting, core.adjustment.sigma, inflation, depths, core)
 
 
-def _solved_core(shot: Shot, frames: list[int], observations: Observations, tracks: Index, options: Options) -> _Core:
+def _solved_core(shot: Shot, frames: list[int], observations: Observations, tracks: Index, options: Options) -> Core:
     """Cameras, lens and shutter on the longest tracks."""
     o = options.polish
     core = core_tracks(observations, len(frames), everywhere=options.estimates_lens)
     few = observations.of(core)
-    found = best_solution(_first_guess(shot, frames, few, tracks[core], _world(observations)), few, options)
+    guess = _first_guess(shot, frames, few, tracks[core], _world(observations))
+    found = turning_reading(guess, few, options)
+    if found is None:
+        found = unless_at_rest(best_solution(guess, few, options), guess, few, options)
     adjustment, few = found.adjustment, found.adjustment.observations
     motion, lens, shutter = None, None, None
     if few.sweep is not None:
@@ -113,11 +117,12 @@ def _solved_core(shot: Shot, frames: list[int], observations: Observations, trac
     if shutter is not None:
         adjustment = solution_from(replace(adjustment.state, lens=shutter.lens.shape), few, options)
     if options.estimates_lens:
-        adjustment, lens = _estimate_lens(adjustment, frames, options, shot.first_focal)
+        adjustment, lens = _estimate_lens(adjustment, frames, options, shot.first_focal, moves=not found.turns)
         shutter = shutter and shutter.known_with(lens)
     if motion is None or lens is not None or shutter is not None:
         motion = classify_motion(adjustment, o)
-    return _Core(core[found.kept], adjustment, motion, lens, shutter, found.moving / len(core))
+    moving = found.moving / len(core)
+    return Core(core[found.kept], adjustment, motion, lens, shutter, moving, found.turns, found.rest)
 
 
 def _first_guess(shot: Shot, frames: list[int], observations: Observations, tracks: Index, world: int) -> State:
@@ -164,14 +169,19 @@ def _world(observations: Observations) -> int:
 
 
 def _estimate_lens(
-    adjustment: BundleAdjustment, frames: list[int], options: Options, first_focal: tuple[Array, float] | None
+    adjustment: BundleAdjustment,
+    frames: list[int],
+    options: Options,
+    first_focal: tuple[Array, float] | None,
+    *,
+    moves: bool,
 ) -> tuple[BundleAdjustment, LensEstimate]:
     """As `estimate_lens`, with a focal length for every frame where a zoom is asked for and found."""
     zoom = None
     if options.lens == "zoom" and len(adjustment.state.log_focal) == 1:
         zoom = find_zoom(adjustment, np.array(frames, np.float64), options.polish)
     if zoom is None or not zoom.found:
-        adjustment, lens = estimate_lens(adjustment, options, first_focal=first_focal)
+        adjustment, lens = estimate_lens(adjustment, options, first_focal=first_focal, moves=moves)
         return adjustment, replace(lens, zoom_std=zoom.std if zoom else None)
     prior = FocalPrior(np.zeros(len(frames)), zoom.information)
     adjustment, lens = estimate_lens(zoom.adjustment, options, prior)
@@ -182,7 +192,7 @@ def _estimate_lens(
 
 
 def _with_fitting_tracks(
-    part: State, core: _Core, observations: Observations, tracks: Index, options: PolishOptions
+    part: State, core: Core, observations: Observations, tracks: Index, options: PolishOptions
 ) -> tuple[State, Observations, Index]:
     """All points for the cameras of `part`, and the tracks that fit them."""
     solved, points = core.adjustment, core.points
@@ -196,7 +206,9 @@ def _with_fitting_tracks(
     )
     state, errors = adjustment.solve(), adjustment.reprojection_errors()
     if options.observation_sigmas is None:
-        kept = _usual_points(observations, errors, options)
+        # Where most of the core is left out, what moves by itself is what is usual.
+        usual = points if core.moving > _MOSTLY_MOVING else np.arange(len(tracks))
+        kept = _usual_points(observations, errors, usual, options)
         return state.of(kept), observations.of(kept), tracks[kept]
     observations, kept = _only(observations, errors < options.observation_sigmas * solved.sigma)
     return state.of(kept), observations, tracks[kept]
@@ -218,11 +230,11 @@ def with_all_points(part: State, solved: State, observations: Observations, core
     return replace(part, bearing=bearing, inverse_distance=inverse)
 
 
-def _usual_points(observations: Observations, errors: Array, options: PolishOptions) -> Index:
-    """Points whose typical error is not far outside that of all points (log scale, robust)."""
+def _usual_points(observations: Observations, errors: Array, usual: Index, options: PolishOptions) -> Index:
+    """Points whose typical error is not far outside that of the usual ones (log scale, robust)."""
     typical = np.log(np.sqrt(observations.mean_by_point(errors**2)) + 1e-6)
-    center = np.median(typical)
-    spread = 1.4826 * np.median(np.abs(typical - center))
+    center = np.median(typical[usual])
+    spread = 1.4826 * np.median(np.abs(typical[usual] - center))
     return np.nonzero(typical < center + options.outlier_sigmas * max(spread, 0.1))[0]
 
 

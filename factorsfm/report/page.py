@@ -15,12 +15,12 @@ from factorsfm.report.document import document, packaged
 from factorsfm.report.wording import (
     explanation,
     failure_sentence,
-    grade,
     status_words,
     verdict_sentence,
 )
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.result.summary import focal_range, with_total
+from factorsfm.result.verdict import Grade, verdict_of
 from factorsfm.support.json_text import json_text
 from factorsfm.support.program import PROGRAM, program_version
 
@@ -31,7 +31,7 @@ _LIBRARIES = ("gtsam", "pycolmap", "opencv-python-headless", "onnxruntime", "num
 def report_html(reconstruction: Reconstruction) -> str:
     """The report as one HTML document that contains all styles, scripts and data."""
     return _document(
-        grade=grade(reconstruction),
+        grade=verdict_of(reconstruction).grade,
         verdict=verdict_sentence(reconstruction),
         explanation=" ".join(explanation(reconstruction)),
         notes=reconstruction.notes,
@@ -48,7 +48,7 @@ def failure_html(
 ) -> str:
     """The report of a shot that could not be reconstructed: the reason, and the status of each frame."""
     return _document(
-        grade="Not solved",
+        grade=Grade.NOT_SOLVED,
         verdict="The camera of this shot could not be solved.",
         explanation=f"{failure_sentence(frames)} {reason[:1].upper()}{reason[1:].rstrip('.')}.",
         notes=[],
@@ -62,7 +62,7 @@ def failure_html(
 
 def _document(
     *,
-    grade: str,
+    grade: Grade,
     verdict: str,
     explanation: str,
     notes: Sequence[str],

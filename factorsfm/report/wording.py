@@ -8,10 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
-from factorsfm.result.summary import median_reprojection_error, registered_share
+from factorsfm.result.summary import registered_share
+from factorsfm.result.verdict import median_reprojection_error, verdict_of
 from factorsfm.support.status import FrameStatus, ShotKind
 
-_DOUBTFUL_PX = 1.0  # median reprojection error; good tracks have 0.1 pixels
 _NO_SHARE = 0.05  # of the depth prior, below which it is not mentioned
 _STATUS = {
     "registered": "solved",
@@ -30,21 +30,6 @@ def status_words(status: FrameStatus) -> str:
     return _STATUS.get(status.value, status.value.replace("_", " "))
 
 
-def grade(reconstruction: Reconstruction) -> str:
-    """The verdict in one to three words."""
-    error = median_reprojection_error(reconstruction)
-    return grade_of(len(reconstruction.registered), len(reconstruction.frames), error)
-
-
-def grade_of(registered: int, frames: int, error_px: float) -> str:
-    """The verdict for a number of registered frames and a median reprojection error (NaN: unknown)."""
-    if not registered:
-        return "Not solved"
-    if error_px > _DOUBTFUL_PX:
-        return "Doubtful"
-    return "Solved" if registered == frames else "Solved in part"
-
-
 def verdict_sentence(reconstruction: Reconstruction) -> str:
     """How many frames are solved, and how well the points fit the footage."""
     sentence = f"The camera is solved in {registered_share(reconstruction)}"
@@ -56,9 +41,7 @@ def verdict_sentence(reconstruction: Reconstruction) -> str:
 
 def explanation(reconstruction: Reconstruction) -> list[str]:
     """What the solve can be used for, in sentences."""
-    sentences = [_motion(reconstruction)]
-    if _is_doubtful(reconstruction):
-        sentences.insert(0, "That is too far: the tracks contradict each other, or the scene moves by itself.")
+    sentences = [*verdict_of(reconstruction).doubts, _motion(reconstruction)]
     known = [frame.observability for frame in reconstruction.registered if frame.observability is not None]
     slide = _largest([item.pixel_slide for item in known])
     if slide is not None:
@@ -85,10 +68,6 @@ def failure_sentence(frames: Sequence[FrameResult]) -> str:
     counts = Counter(frame.status for frame in frames).most_common()
     found = "; ".join(f"{n} {'frame' if n == 1 else 'frames'}: {status_words(status)}" for status, n in counts)
     return f"{found}." if found else "No frame was read."
-
-
-def _is_doubtful(reconstruction: Reconstruction) -> bool:
-    return median_reprojection_error(reconstruction) > _DOUBTFUL_PX
 
 
 def _motion(reconstruction: Reconstruction) -> str:

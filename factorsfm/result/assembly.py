@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pycolmap
@@ -19,7 +19,7 @@ from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.polish.polished import Polished
 from factorsfm.priors.depth_map import DepthKind
 from factorsfm.result.frame_results import SourceFrame, frame_results
-from factorsfm.result.notes import result_notes
+from factorsfm.result.notes import result_doubts, result_notes
 from factorsfm.result.reconstruction import LensFit, ObservationNoise, Reconstruction, RollingShutter
 from factorsfm.support.parallax import parallax
 from factorsfm.support.rotations import camera_centers
@@ -75,7 +75,7 @@ def assemble(
         point_std=polished.point_std[kept] / state.inverse_distance[kept] if general else None,
         noise=observations.noise,
         lens=None if polished.lens is None else _lens_fit(polished.lens),
-        shutter=None if polished.shutter is None else _rolling_shutter(polished.shutter, recorded=polished.recorded),
+        shutter=None if polished.shutter is None else _rolling_shutter(polished, polished.shutter),
         rolled=observations.rolled,
         metric=scale is not None,
         control=polished.control,
@@ -84,6 +84,7 @@ def assemble(
     )
     has_depth = any(image.tracks.depth is not None for image in images)
     guessed = camera if polished.lens is None and not lens_given else None
+    result.doubts += result_doubts(polished)
     result.notes += result_notes(polished, result, guessed, depth_given=depth_kind is not None, has_depth=has_depth)
     if polished.world_alignment is not None:
         _place(result, polished.world_alignment)
@@ -188,9 +189,10 @@ def _solved_camera(polished: Polished, camera: pycolmap.Camera) -> pycolmap.Came
     return with_distortion(camera, focal, lens.shape) if lens.bends else with_focal(camera, focal)
 
 
-def _rolling_shutter(shutter: Shutter, *, recorded: bool) -> RollingShutter:
+def _rolling_shutter(polished: Polished, shutter: Shutter) -> RollingShutter:
     columns, rows = shutter.readout.tolist()
-    return RollingShutter(rows or columns, shutter.std, "rows" if rows else "columns", recorded)
+    along: Literal["rows", "columns"] = "rows" if rows else "columns"
+    return RollingShutter(rows or columns, shutter.std, along, polished.recorded, polished.shutter_error)
 
 
 def _lens_fit(estimate: LensEstimate) -> LensFit:

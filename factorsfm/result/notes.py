@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from factorsfm.control.fit import ControlFit
 from factorsfm.lens.lens import LensEstimate
+from factorsfm.motion.shot_kind import LEAST_GAIN
 from factorsfm.polish.polished import Polished
 from factorsfm.result.reconstruction import FrameResult, Reconstruction, RollingShutter
 from factorsfm.support.status import ShotKind
@@ -21,6 +22,40 @@ _NOTED_SLIDE_PX = 0.5
 _MERGED_GAP = 5  # registered frames between two weak stretches that are told as one
 _SHORTEST_STRETCH = 3  # frames
 _MOST_STRETCHES = 2  # sentences of each sort
+_MOST_OF_THE_IMAGE = 0.5  # resting, from which nobody doubts that the camera is fixed
+
+
+def result_doubts(polished: Polished) -> list[str]:
+    """Why the images leave open what the camera does, in sentences: another reading of the shot is nearly as good."""
+    motion, rest, doubts = polished.motion, polished.rest, []
+    if rest is not None and rest.fixed and rest.share < _MOST_OF_THE_IMAGE:
+        doubts.append(
+            f"{100 * rest.share:.0f} % of the image rests, and what moves is larger but follows no single motion "
+            f"({100 * rest.explained:.0f} % of it do): taken for a fixed camera before things that move by themselves."
+        )
+    if rest is not None and not rest.fixed and motion.kind is ShotKind.GENERAL:
+        doubts.append(
+            f"{100 * rest.share:.0f} % of the image rests: the camera moves before something far away, or it is fixed "
+            "and all else that is seen moves by itself."
+        )
+    elif motion.kind is ShotKind.GENERAL and polished.turns:
+        doubts.append(
+            "A camera that only turns explains the tracks nearly as well, through a lens of its own: translation and "
+            "lens cannot be told apart here."
+        )
+    elif motion.close:
+        doubts.append(
+            f"A camera that moves explains the tracks hardly better than one that only turns (by {motion.gain:.2f} of "
+            f"the noise, {LEAST_GAIN:.1f} is asked for): translation is at the limit of what can be seen."
+        )
+    if polished.reversible:
+        doubts.append(
+            "Near and far may be exchanged, and the motion reversed: the depth prior says so, and the images hardly "
+            "tell."
+        )
+    if polished.lens is not None and polished.lens.misfit_px:
+        doubts.append(f"The tracks fit no lens: their typical error is {polished.lens.misfit_px:.2f} pixels.")
+    return doubts
 
 
 def result_notes(
@@ -45,6 +80,11 @@ def result_notes(
     if polished.unused:
         notes.append(
             f"{polished.unused}: not used, since a camera that stays in its place ties no lengths to the images."
+        )
+    if polished.contradiction is not None:
+        notes.append(
+            "The depth prior contradicts the geometry and is not used: its inverse depths correlate with those of the "
+            f"points by {polished.contradiction:.2f}."
         )
     if depth_given and not has_depth:
         notes.append("The depth prior took no part: no frame that needed it has a usable depth map.")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -63,6 +63,7 @@ class _Summary:
     options: dict[str, Any]
     parts: int
     statuses: list[_Status]
+    doubts: list[str] = field(default_factory=list)
 
 
 def read_result(directory: str | Path) -> Reconstruction:
@@ -139,6 +140,7 @@ def _reconstruction(summary: _Summary, model: pycolmap.Reconstruction) -> Recons
         metric=summary.metric,
         control=summary.control,
         imu=summary.imu,
+        doubts=summary.doubts,
         notes=summary.notes,
         seconds=summary.seconds,
         options=summary.options,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -68,12 +69,15 @@ class RollingShutter:
         along: "rows" from top to bottom, or "columns" from left to right, as in images that were turned upright.
         recorded: True if the poses are those of a global-shutter camera that best reproduces the recorded images;
             False if they are the poses at the moment when the middle of the image is read.
+        reprojection_error: median over all observations with the shutter in the model (pixels); NaN if unknown. Poses
+            that are `recorded` have a larger one, which says nothing against the tracks.
     """
 
     readout: float
     std: float
     along: Literal["rows", "columns"]
     recorded: bool
+    reprojection_error: float = math.nan
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,6 +178,7 @@ class Reconstruction:
         metric: whether the world unit is the metre (from a metric prior, or from control).
         control: how well the control is met, or factors that were added; None without either.
         imu: what an IMU has given, None without one that took part.
+        doubts: why the images leave open what the camera does, in sentences; empty where they do not.
         notes: sentences for the user (translation unobservable, focal length guessed, ...).
         seconds: wall time by stage.
         options: all options as plain data.
@@ -200,6 +205,7 @@ class Reconstruction:
     metric: bool = False
     control: ControlFit | None = None
     imu: ImuFit | None = None
+    doubts: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
     options: dict[str, Any] = field(default_factory=dict)

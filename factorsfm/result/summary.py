@@ -12,16 +12,20 @@ import numpy as np
 
 from factorsfm.camera.files import camera_to_json
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
+from factorsfm.result.verdict import Grade, median_reprojection_error, verdict_of
 from factorsfm.support.program import PROGRAM, program_version
 from factorsfm.support.status import ShotKind
 
 
 def summary(reconstruction: Reconstruction) -> dict[str, Any]:
     """The content of summary.json; a missing number is NaN here and null in the file."""
+    judged = verdict_of(reconstruction)
     return {
         "program": PROGRAM,
         "version": program_version(),
         "reconstructed": True,
+        "grade": judged.grade,
+        "doubts": judged.doubts,
         "verdict": verdict(reconstruction),
         "source": reconstruction.options.get("source"),
         "frames": len(reconstruction.frames),
@@ -57,6 +61,7 @@ def failure_summary(
         "program": PROGRAM,
         "version": program_version(),
         "reconstructed": False,
+        "grade": Grade.NOT_SOLVED,
         "reason": reason,
         "source": options.get("source"),
         "frames": len(frames),
@@ -79,10 +84,11 @@ def verdict(reconstruction: Reconstruction) -> str:
     error = median_reprojection_error(reconstruction)
     if math.isfinite(error):
         sentence += f", median reprojection error {error:.2f} px"
+    doubtful = "; doubtful" if verdict_of(reconstruction).grade is Grade.DOUBTFUL else ""
     if reconstruction.kind is ShotKind.GENERAL:
-        return f"{sentence}, parallax {reconstruction.parallax:.3f}"
+        return f"{sentence}, parallax {reconstruction.parallax:.3f}{doubtful}"
     motion = "pure rotation" if reconstruction.kind is ShotKind.ROTATION else "static camera"
-    return f"{sentence}; {motion}, no parallax"
+    return f"{sentence}; {motion}, no parallax{doubtful}"
 
 
 def part_name(number: int) -> str:
@@ -98,18 +104,12 @@ def registered_share(reconstruction: Reconstruction) -> str:
 
 def conclusion(reconstruction: Reconstruction, output: Path) -> str:
     """The sentences that a command prints after it has written a result."""
+    judged = verdict_of(reconstruction)
+    doubts = [f"{Grade.DOUBTFUL}: {doubt}" for doubt in judged.doubts]
     notes = [f"Note: {note}" for note in reconstruction.notes]
     parts = [f"{part_name(n)}: {verdict(other)}." for n, other in enumerate(reconstruction.others, 2)]
-    return "\n".join(
-        [f"{verdict(reconstruction)}.", *notes, *parts, f"Result in {output}; open {output / 'report.html'}"]
-    )
-
-
-def median_reprojection_error(reconstruction: Reconstruction) -> float:
-    """Median over all observations, pixels; NaN without observations."""
-    errors = reconstruction.observation_error
-    errors = errors[np.isfinite(errors)]
-    return float(np.median(errors)) if len(errors) else float("nan")
+    last = f"{judged.grade}. Result in {output}; open {output / 'report.html'}"
+    return "\n".join([f"{verdict(reconstruction)}.", *doubts, *notes, *parts, last])
 
 
 def focal_range(reconstruction: Reconstruction) -> tuple[float, float] | None:
