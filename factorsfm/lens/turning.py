@@ -68,7 +68,7 @@ def _chained(guess: State, observations: Observations) -> State:
         known = length > 0
         last = rotation[max(k - 1, 0)]
         if known.sum() >= _FEWEST:
-            last = _turn(before[known] / length[known, None], ray[here][known], last, float(guess.focal[k]))
+            last = turn_to(before[known] / length[known, None], ray[here][known], last, float(guess.focal[k]))
         rotation[k] = last
         seen[o.point[here]] += ray[here] @ last
     still = replace(
@@ -82,8 +82,12 @@ def _chained(guess: State, observations: Observations) -> State:
     return still.seen_from(guess.world)
 
 
-def _turn(before: Array, ray: Array, start: Array, focal: float) -> Array:
-    """The rotation that takes unit directions to rays, (n, 3) each, by re-weighted least squares over the image."""
+def turn_to(before: Array, ray: Array, start: Array, focal: float) -> Array:
+    """The rotation that takes unit directions to rays, (n, 3) each, by re-weighted least squares over the image.
+
+    Args:
+        start: the rotation of a frame nearby; focal: pixels.
+    """
     cell = image_cells(ray[:, :2], *_CELLS)
     area = 1.0 / np.bincount(cell)[cell]
     turn = start

@@ -17,6 +17,7 @@ from factorsfm.motion.at_rest import Rest
 from factorsfm.motion.burn_ins import contradicts, resting
 from factorsfm.motion.moving import SPOILT, bounded_cost, standing_out
 from factorsfm.support.options import Options, PolishOptions
+from factorsfm.support.rotations import exponential
 
 Index = NDArray[np.int64]
 
@@ -157,10 +158,16 @@ def in_front(part: State) -> State:
 
 
 def reversed_scene(part: State) -> State:
-    """Near and far exchanged and the motion reversed: in a narrow view the images are almost the same."""
+    """Near and far exchanged and the motion reversed: in a narrow view the images are almost the same.
+
+    Each camera also turns, by twice the angle under which its way is seen from the middle of the scene: what was seen
+    there stays where it was. Without that, the way back to the first scene is shorter than that to its reversal.
+    """
     center = float(np.median(part.inverse_distance))
     inverse = np.clip(2.0 * center - part.inverse_distance, 0.05 * center, 4.0 * center)
-    return replace(part, translation=-part.translation, inverse_distance=inverse)
+    x, y, z = 2.0 * center * part.translation.T
+    turn = exponential(np.stack([-y, x, np.zeros_like(x)], 1) / np.maximum(1.0 + z, 0.5)[:, None])
+    return replace(part, rotation=turn @ part.rotation, translation=-part.translation, inverse_distance=inverse)
 
 
 def core_tracks(observations: Observations, frames: int, *, everywhere: bool = False) -> Index:

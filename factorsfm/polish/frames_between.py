@@ -13,11 +13,13 @@ from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import ErrorModel
 from factorsfm.adjustment.residuals import cauchy
 from factorsfm.lens.lens import Lens, LensEstimate
+from factorsfm.lens.turning import turn_to
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.mapping.registration import register_image
 from factorsfm.polish.polished import Polished
 from factorsfm.polish.shot import Shot
 from factorsfm.support.options import Options
+from factorsfm.support.status import ShotKind
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -83,18 +85,29 @@ def _registered_between(
         if len(mine) < m.min_inliers:
             result.left_out[f] = too_few_tracks(len(mine), m.min_inliers)
             continue
-        near = int(solved[np.argmin(np.abs(solved - f))])
-        found = register_image(
-            points[seen.point[mine]], xy[mine], *poses[near],
-            focal=float(focal[row]), sigma=max(result.sigma, SMALLEST_SIGMA_PX), inlier_px=m.inlier_px,
-        )  # fmt: skip
-        if found.inliers.sum() >= m.min_inliers:
-            poses[f] = found.rotation, found.translation
+        near = poses[int(solved[np.argmin(np.abs(solved - f))])]
+        if result.motion.kind is ShotKind.GENERAL:
+            found = register_image(
+                points[seen.point[mine]], xy[mine], *near,
+                focal=float(focal[row]), sigma=max(result.sigma, SMALLEST_SIGMA_PX), inlier_px=m.inlier_px,
+            )  # fmt: skip
+            pose, inliers = (found.rotation, found.translation), int(found.inliers.sum())
         else:
-            result.left_out[f] = (
-                f"{found.inliers.sum()} of {m.min_inliers} needed inliers among {len(mine)} tracks of the polish"
-            )
+            pose, inliers = _turned(state.bearing[seen.point[mine]], xy[mine], near[0], float(focal[row]), m.inlier_px)
+        if inliers >= m.min_inliers:
+            poses[f] = pose
+        else:
+            result.left_out[f] = f"{inliers} of {m.min_inliers} needed inliers among {len(mine)} tracks of the polish"
     return poses
+
+
+def _turned(bearing: Array, xy: Array, near: Array, focal: float, inlier_px: float) -> tuple[Pose, int]:
+    """The pose of a camera that does not translate, and the number of its inliers."""
+    ray = np.column_stack([xy, np.ones(len(xy))])
+    rotation = turn_to(bearing, ray / np.linalg.norm(ray, axis=1, keepdims=True), near, focal)
+    q = bearing @ rotation.T
+    error = focal * np.linalg.norm(q[:, :2] / q[:, 2:] - xy, axis=1)
+    return (rotation, np.zeros(3)), int(((error < inlier_px) & (q[:, 2] > 0.0)).sum())
 
 
 def _insert(

@@ -23,8 +23,6 @@ logger = logging.getLogger(__name__)
 # networks on shots with exact truth none has a correlation below 0.6: one in fifty that is negative is a generous
 # guess, and that is a cost of 4.
 _PRIOR_DECIDES = 4.0
-# Beyond this the images alone decide: they would have to be wrong by five standard deviations.
-_IMAGES_DECIDE = 12.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,13 +33,11 @@ class NearAndFar:
         adjustment: converged, of the scene or its reversal.
         prior: with the weight that it earns; None without one, or where it contradicts the geometry.
         correlation: of a prior that contradicts the geometry, with its inverse depths; None where none does.
-        open: whether the scene may be reversed as well.
     """
 
     adjustment: BundleAdjustment
     prior: WeighedPrior | None = None
     correlation: float | None = None
-    open: bool = False
 
 
 def near_and_far(
@@ -68,7 +64,7 @@ def near_and_far(
     logger.info("the prior says the opposite; the reversed scene costs %.1f more", loss / inflation)
     if fits and loss < _PRIOR_DECIDES * inflation:
         return NearAndFar(other, again)
-    return NearAndFar(solved, None, correlation, open=loss < _IMAGES_DECIDE * inflation)
+    return NearAndFar(solved, None, correlation)
 
 
 def _cost(adjustment: BundleAdjustment, sigma: float) -> float:

@@ -167,7 +167,7 @@ def _solved(
         *adjustment.observation_sigmas(), start.core.motion, *_pose_covariances(covariance, adjustment.state),
         camera_observability(adjustment, marginals, covariance), marginals.inverse_distance_std(covariance),
         left_out, prior, start.core.lens, start.core.shutter, moving=start.core.moving, turns=start.core.turns,
-        rest=start.core.rest, contradiction=start.depths.correlation, reversible=start.depths.open,
+        rest=start.core.rest, contradiction=start.depths.correlation,
     )  # fmt: skip
     result.describe_prior(adjustment, covariance)
     return adjustment, result

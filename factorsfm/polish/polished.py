@@ -45,7 +45,7 @@ class Polished:
         moving: share of the longest tracks that move by themselves and are left out.
         turns: whether a camera that only turns explains the tracks through a lens of its own, see `turning_reading`.
         rest: what rests in the image while other things move, None where nothing does.
-        contradiction, reversible: see `NearAndFar.correlation` and `NearAndFar.open`.
+        contradiction: see `NearAndFar.correlation`.
         world_alignment: from this world to that of the control; control: its residuals. None without control.
         unused: "Control" or "Factors added", where there are some that could not take part.
     """
@@ -74,7 +74,6 @@ class Polished:
     turns: bool = False
     rest: Rest | None = None
     contradiction: float | None = None
-    reversible: bool = False
     world_alignment: Similarity | None = None
     control: ControlFit | None = None
     unused: str = ""

@@ -9,6 +9,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from factorsfm.adjustment.prior_term import LEAST_CORRELATION
 from factorsfm.control.fit import ControlFit
 from factorsfm.lens.lens import LensEstimate
 from factorsfm.motion.shot_kind import LEAST_GAIN
@@ -30,8 +31,8 @@ def result_doubts(polished: Polished) -> list[str]:
     motion, rest, doubts = polished.motion, polished.rest, []
     if rest is not None and rest.fixed and rest.share < _MOST_OF_THE_IMAGE:
         doubts.append(
-            f"{100 * rest.share:.0f} % of the image rests, and what moves is larger but follows no single motion "
-            f"({100 * rest.explained:.0f} % of it do): taken for a fixed camera before things that move by themselves."
+            f"{100 * rest.share:.0f} % of the image rests, and one motion explains only {100 * rest.explained:.0f} % "
+            "of what does not: taken for a fixed camera before things that move by themselves."
         )
     if rest is not None and not rest.fixed and motion.kind is ShotKind.GENERAL:
         doubts.append(
@@ -48,10 +49,10 @@ def result_doubts(polished: Polished) -> list[str]:
             f"A camera that moves explains the tracks hardly better than one that only turns (by {motion.gain:.2f} of "
             f"the noise, {LEAST_GAIN:.1f} is asked for): translation is at the limit of what can be seen."
         )
-    if polished.reversible:
+    if polished.contradiction is not None and polished.contradiction < -LEAST_CORRELATION:
         doubts.append(
-            "Near and far may be exchanged, and the motion reversed: the depth prior says so, and the images hardly "
-            "tell."
+            "The depth prior says the opposite of the geometry, but the reversed scene does not fit the images: the "
+            "lens, what moves by itself, or the prior is wrong."
         )
     if polished.lens is not None and polished.lens.misfit_px:
         doubts.append(f"The tracks fit no lens: their typical error is {polished.lens.misfit_px:.2f} pixels.")

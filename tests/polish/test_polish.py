@@ -192,3 +192,17 @@ def test_the_larger_part_of_what_falls_apart_is_kept():
     np.testing.assert_array_equal(joined, [False] * 4 + [True] * 4)
     np.testing.assert_array_equal(shared, [6, 6, 6, 0, 46, 46, 46, 46])
     np.testing.assert_array_equal(connected_frames(observations, 8, 6)[0], [True] * 3 + [False] + [True] * 4)
+
+
+@pytest.mark.parametrize("motion", ["rotation", "static"])
+def test_frames_between_do_not_translate_where_the_others_do_not(motion):
+    problem = make_problem(motion, frames=24, points=200, noise_px=0.1)
+    options = Options.preset_named("geometry")
+    options = replace(options, polish=replace(options.polish, max_frames=6))
+    points = np.arange(len(problem.truth.bearing)), problem.truth.points
+    result = polish(mapped_images(problem, problem.truth), points, np.array([problem.focal]), options)
+    assert result.motion.kind == motion
+    assert len(result.frames) == 24
+    assert not result.state.translation.any()
+    error_px = problem.focal * angles_between(result.state.rotation, problem.truth.rotation)
+    assert 0.001 < error_px.max() < 0.2

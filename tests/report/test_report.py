@@ -247,7 +247,7 @@ def test_verdict_for_compositors() -> None:
         frame.observability = CameraObservability(0.01, 0.9, 1.5, 0.004)
     assert "may slide by less than 0.01 pixels" in " ".join(explanation(reconstruction))
     reconstruction.observation_error = reconstruction.observation_error + 2
-    assert explanation(reconstruction)[0].startswith("That is too far")
+    assert explanation(reconstruction)[0].startswith("Half of the tracks miss by more than 2.35 pixels")
     assert ">Doubtful</span>" in report_html(reconstruction)
     turning = replace(reconstruction, kind=ShotKind.ROTATION, metric=True)
     assert "only turns" in explanation(turning)[1]
