@@ -176,7 +176,7 @@ def turns_before_shutter(adjustment: BundleAdjustment, motion: Motion, options: 
 def _solved_with_readout(
     adjustment: BundleAdjustment, state: State, options: Options, *, moves: bool
 ) -> BundleAdjustment | None:
-    """Converged with a readout along rows or columns, None where it is short."""
+    """Converged with a readout along rows or columns, None where it is short, or where the lens has no ray any more."""
     o = adjustment.observations
     shape = shape_sigmas(options.lens, float(np.ptp(state.normalized(o), axis=0).max()))
 
@@ -194,8 +194,7 @@ def _solved_with_readout(
     if step.max() < _LEAST_STEP:
         return None
     solved = problem(np.arange(2) == np.argmax(step))
-    solved.solve()
-    return solved
+    return solved if np.isfinite(solved.solve().normalized(o)).all() else None
 
 
 def _believed(solved: BundleAdjustment, guess: State) -> Shutter | None:

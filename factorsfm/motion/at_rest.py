@@ -21,11 +21,12 @@ Array = NDArray[np.float64]
 # nothing stays within 0.8 over three seconds, and before a slow dolly what is far passes through this in a few frames.
 _RESTS_PX = 0.25
 _LONG = 0.25  # of the shot, for which a point must be seen: everything rests for a moment
-_ALWAYS = 0.1  # share of the frames in which less may rest: a slow start is no rest
+_ALWAYS = 0.25  # share of the frames in which less may rest: a slow start is no rest
 _CELLS = (8, 5)  # across and down; each counts once, however many tracks it has
 _NOISES = 3.0  # standard deviations within which something is explained
 _LEAST_NOISE_PX = 0.1
-LEAST_SHARE = 0.15  # of the image: captions cover less, and what rests by chance
+LEAST_SHARE = 0.08  # of the image; behind a face that fills most of it little more is seen, and a moving camera has 0
+_LEAST_SPREAD = 3  # rows and columns of cells: captions and logos lie along the border, a background everywhere
 _MOST_OF_THE_OTHERS = 0.5  # a general motion that explains less of what does not rest is none
 
 
@@ -34,7 +35,7 @@ class Rest:
     """What rests in the image while other things move.
 
     Attributes:
-        share: of the image that rests in nearly every frame.
+        share: of the image that rests in most frames.
         explained: share of what does not rest that one general motion of the camera explains.
     """
 
@@ -58,7 +59,10 @@ def at_rest(observations: Observations) -> NDArray[np.bool_]:
 
 
 def resting_share(observations: Observations, rests: NDArray[np.bool_]) -> float:
-    """Share of what is seen of the image that rests in nearly every frame."""
+    """Share of what is seen of the image that rests in most frames; 0 where it all lies in one strip."""
+    row, column = np.divmod(image_cells(observations.pixels, *_CELLS)[rests[observations.point]], _CELLS[0])
+    if min(len(np.unique(row)), len(np.unique(column))) < _LEAST_SPREAD:
+        return 0.0
     weight = image_weights(observations)
     whole = np.bincount(observations.frame, weight)
     part = np.bincount(observations.frame, weight * rests[observations.point], len(whole))

@@ -46,7 +46,9 @@ def turning_reading(guess: State, few: Observations, options: Options) -> Camera
     found = on_what_fits(start, few, options)
     motion = classify_motion(found.adjustment, options.polish)
     logger.info("translation explains %.2f more of an observation than turning alone", motion.gain)
-    turns = motion.kind is not ShotKind.GENERAL
+    if motion.kind is ShotKind.STATIC:  # it says nothing of its lens
+        return None
+    turns = motion.kind is ShotKind.ROTATION
     if not turns and found.adjustment.observations.sweep is not None:
         turns = turns_before_shutter(found.adjustment, motion, options) is not None
     return replace(found, turns=True) if turns else None
