@@ -17,6 +17,7 @@ from factorsfm.lens.certainty import lens_deviations
 from factorsfm.lens.lens import READOUT_SIGMA, Lens, LensEstimate, shape_sigmas, through
 from factorsfm.lens.search import search_lens
 from factorsfm.lens.solver import LensSolver, NotInvertibleError
+from factorsfm.motion.shot_kind import classify_motion
 from factorsfm.support.options import DETERMINED_FOCAL_STD, GIVEN_FOCAL_STD, LensFreedom, Options, PolishOptions
 
 Array = NDArray[np.float64]
@@ -93,7 +94,8 @@ def estimate_lens(
     first, bent = (guess, None) if held or not moves else _searched(adjustment, o, sigmas)
     solver = LensSolver(adjustment.observations, o, focal_prior)
     start = _seen_through(adjustment.state, first)
-    best = straight = _straight_solution(solver, start, adjustment.sigma, straight_sigmas, moves=moves)
+    by_itself = start if moves else classify_motion(adjustment, options.polish).rotation_only
+    best = straight = _straight_solution(solver, by_itself, adjustment.sigma, straight_sigmas, moves=moves)
     if sigmas[DISTORTION].any():
         # Strong distortion moves the valley of the focal length: a start without any does not lead there.
         starts = [] if bent is None else [(_seen_through(adjustment.state, bent), adjustment.sigma, moves)]

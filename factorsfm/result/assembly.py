@@ -75,7 +75,9 @@ def assemble(
         point_std=polished.point_std[kept] / state.inverse_distance[kept] if general else None,
         noise=observations.noise,
         lens=None if polished.lens is None else _lens_fit(polished.lens),
-        shutter=None if polished.shutter is None else _rolling_shutter(polished, polished.shutter),
+        shutter=None
+        if polished.shutter is None
+        else _rolling_shutter(polished.shutter, recorded=polished.recorded, error=polished.shutter_error),
         rolled=observations.rolled,
         metric=scale is not None,
         control=polished.control,
@@ -189,10 +191,10 @@ def _solved_camera(polished: Polished, camera: pycolmap.Camera) -> pycolmap.Came
     return with_distortion(camera, focal, lens.shape) if lens.bends else with_focal(camera, focal)
 
 
-def _rolling_shutter(polished: Polished, shutter: Shutter) -> RollingShutter:
+def _rolling_shutter(shutter: Shutter, *, recorded: bool, error: float) -> RollingShutter:
     columns, rows = shutter.readout.tolist()
     along: Literal["rows", "columns"] = "rows" if rows else "columns"
-    return RollingShutter(rows or columns, shutter.std, along, polished.recorded, polished.shutter_error)
+    return RollingShutter(rows or columns, shutter.std, along, recorded, error)
 
 
 def _lens_fit(estimate: LensEstimate) -> LensFit:

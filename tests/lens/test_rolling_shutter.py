@@ -233,7 +233,7 @@ def test_the_note_says_how_images_are_read(readout, order):
     found = handheld_polished("rolling").shutter
     shutter = replace(found, lens=Lens(found.lens.focal, np.r_[np.zeros(4), readout]), std=0.021)
 
-    said = _rolling_shutter(shutter, recorded=True)
+    said = _rolling_shutter(shutter, recorded=True, error=0.1)
     note = shutter_note(said, [k / 25 for k in range(4)])
     assert f"from {order} in {abs(said.readout):.2f} ± 0.02" in note
     assert f"({40 * abs(said.readout):.1f} ms)" in note
