@@ -29,6 +29,9 @@ _TOLERANCE = 1e-5  # the focal length lies along a flat valley
 _OPEN_FOCAL_STD = 0.02  # like `DETERMINED_FOCAL_STD`, where a distortion that is not believed is part of it
 _HELD_STD = 1e-6  # relative, of a focal length that is known
 _LARGEST_RATIO = 4.0  # of the focal length to the guess
+# Of log focal length: up to this a camera that turns keeps what it has found, since through the guess it would seem to
+# move; beyond, it turns by so little that the guess explains the images as well.
+_TURNING_STD = 1.0
 _MISFIT = 1.5  # of the standard deviation above which a solution is doubted
 # Distortion is believed where neither random errors explain it nor those of tracks that move together: an actor without
 # a mask looks like a displacement of 1 to 4 thousandths of the width at the outermost tracks.
@@ -205,8 +208,7 @@ def _concluded(
     # In a long valley a standard deviation says little.
     counts = sound and float(best.std[: best.groups].max()) < GIVEN_FOCAL_STD
     focal, rough = _kept_focal(lens.focal, focal_std, first_focal, counts=bool(counts))
-    if not best.moves and sound and float(focal_std.max()) < first_focal[1]:
-        # Through another focal length, a camera that turns would seem to move.
+    if not best.moves and sound and float(focal_std.max()) < _TURNING_STD:
         focal, rough = lens.focal, True
     if not rough:
         shape_std = np.full(LENS_SIZE, np.nan)
