@@ -112,7 +112,7 @@ def _solved_core(shot: Shot, frames: list[int], observations: Observations, trac
     adjustment, few = found.adjustment, found.adjustment.observations
     motion, lens, shutter = None, None, None
     if few.sweep is not None:
-        motion = classify_motion(adjustment, o)
+        motion = _motion(adjustment, found.rest, o)
         shutter = find_shutter(adjustment, motion, options)
     if shutter is not None:
         adjustment = solution_from(replace(adjustment.state, lens=shutter.lens.shape), few, options)
@@ -120,9 +120,15 @@ def _solved_core(shot: Shot, frames: list[int], observations: Observations, trac
         adjustment, lens = _estimate_lens(adjustment, frames, options, shot.first_focal, moves=not found.turns)
         shutter = shutter and shutter.known_with(lens)
     if motion is None or lens is not None or shutter is not None:
-        motion = classify_motion(adjustment, o)
+        motion = _motion(adjustment, found.rest, o)
     moving = found.moving / len(core)
     return Core(core[found.kept], adjustment, motion, lens, shutter, moving, found.turns, found.rest)
+
+
+def _motion(adjustment: BundleAdjustment, rest: Rest | None, options: PolishOptions) -> Motion:
+    """As `classify_motion`; what rests before a fixed camera may drift in the tracker, but is no sign of a motion."""
+    motion = classify_motion(adjustment, options)
+    return replace(motion, kind=ShotKind.STATIC) if rest is not None and rest.fixed else motion
 
 
 def _first_guess(shot: Shot, frames: list[int], observations: Observations, tracks: Index, world: int) -> State:
