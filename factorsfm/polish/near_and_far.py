@@ -19,9 +19,9 @@ from factorsfm.tracks.image_tracks import ImageTracks
 
 logger = logging.getLogger(__name__)
 
-# By how much the cost of the reversed scene may be higher, for independent errors, and the prior still decide. Of the
-# networks on shots with exact truth none has a correlation below 0.6: one in fifty that is negative is a generous
-# guess, and that is a cost of 4.
+# By how much the cost of the reversed scene may be higher, for independent errors, and the prior still decide. On
+# rendered shots of rigid scenes the network has correlations of 0.6 to 0.96; beside large figures that move by
+# themselves down to -0.36. One in fifty that is negative for a right scene is a cost of 4.
 _PRIOR_DECIDES = 4.0
 
 
