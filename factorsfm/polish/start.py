@@ -20,6 +20,7 @@ from factorsfm.lens.rolling_shutter import Shutter, find_shutter
 from factorsfm.lens.zoom import find_zoom
 from factorsfm.mapping.triangulation import Triangulation, triangulate
 from factorsfm.motion.shot_kind import Motion, classify_motion
+from factorsfm.motion.suspects import agreeing
 from factorsfm.polish.camera_starts import best_solution, core_tracks, solution_from
 from factorsfm.polish.shot import Shot
 from factorsfm.support.options import Options, PolishOptions
@@ -95,14 +96,15 @@ def polish_start(
             prior = weigh_prior(solved, solved.observations, tracks[core.points], shot.tracks(frames), inflation)
 
     progress("polish: points")
-    fitting = _with_fitting_tracks(part, core, observations, tracks, options.polish)
+    fitting = _with_fitting_tracks(part, core, observations, tracks, shot.suspects, options.polish)
     return PolishStart(*fitting, solved.sigma, inflation, motion, prior, core.lens, core.shutter, core.moving)
 
 
 def _solved_core(shot: Shot, frames: list[int], observations: Observations, tracks: Index, options: Options) -> _Core:
     """Cameras, lens and shutter on the longest tracks."""
     o = options.polish
-    core = core_tracks(observations, len(frames), everywhere=options.estimates_lens)
+    trusted = shot.trusted(tracks)
+    core = trusted[core_tracks(observations.of(trusted), len(frames), everywhere=options.estimates_lens)]
     few = observations.of(core)
     found = best_solution(_first_guess(shot, frames, few, tracks[core], _world(observations)), few, options)
     adjustment, few = found.adjustment, found.adjustment.observations
@@ -182,9 +184,9 @@ def _estimate_lens(
 
 
 def _with_fitting_tracks(
-    part: State, core: _Core, observations: Observations, tracks: Index, options: PolishOptions
+    part: State, core: _Core, observations: Observations, tracks: Index, suspects: Index, options: PolishOptions
 ) -> tuple[State, Observations, Index]:
-    """All points for the cameras of `part`, and the tracks that fit them."""
+    """All points for the cameras of `part`, and the tracks that fit them; of the suspects those that agree."""
     solved, points = core.adjustment, core.points
     with_ray = np.asarray(np.isfinite(solved.state.normalized(observations)).all(axis=1))
     if not with_ray.all():
@@ -195,6 +197,11 @@ def _with_fitting_tracks(
         state, observations, replace(options, iterations=4), solved.errors, free=Free(cameras=False)
     )
     state, errors = adjustment.solve(), adjustment.reprojection_errors()
+    agree = agreeing(observations, errors, np.isin(tracks, suspects), options.outlier_sigmas)
+    if not agree.all():
+        kept = np.flatnonzero(agree)
+        state, tracks, errors = state.of(kept), tracks[kept], errors[agree[observations.point]]
+        observations = observations.of(kept)
     if options.observation_sigmas is None:
         kept = _usual_points(observations, errors, options)
         return state.of(kept), observations.of(kept), tracks[kept]

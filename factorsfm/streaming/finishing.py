@@ -41,6 +41,7 @@ class EndedShot:
         depth: the prior; without_depth: why it failed, by the frame's index.
         control: what is known beforehand; imu: beside the stream.
         seconds: of the stages so far; that of the polish is added.
+        suspects: ids of the tracks that count only where they agree with the others.
     """
 
     frames: Sequence[SeenFrame]
@@ -54,6 +55,7 @@ class EndedShot:
     imu: ImuSource | None
     options: Options
     seconds: StageSeconds
+    suspects: NDArray[np.int64]
 
     def reconstruction(self, progress: Progress | None) -> Reconstruction:
         """Polish over all frames and tracks; errors as in `Stream.finish`."""
@@ -103,6 +105,7 @@ class EndedShot:
             factors=factors,
             first_focal=(np.array([self.mapper.first_focal]), first_focal_std(self.camera, given=self.lens_given)),
             recording=self._recording(),
+            suspects=self.suspects,
         )
 
     def _recording(self) -> Recording | None:
