@@ -113,7 +113,7 @@ def agreeing_tracks(
     bearing[suspected], inverse[suspected] = found.bearing, found.inverse_distance
     state = replace(cameras, bearing=bearing, inverse_distance=inverse)
     errors = BundleAdjustment(state, observations, _SOLVER, ErrorModel(options.pixel_sigma)).reprojection_errors()
-    return judged, agreeing(observations, errors, suspected, _SOLVER.outlier_sigmas)[suspected]
+    return judged, agreeing(observations, errors, suspected)[suspected]
 
 
 def _add_points(

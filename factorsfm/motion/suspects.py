@@ -18,27 +18,27 @@ _NEIGHBOURS = 10  # suspects, with the one that is judged
 _REACH, _FRAMES = 8, 16  # a step of an eighth of the image leads as far away as one of so many frames
 # More than half of the neighbours must be as exact as most of the scene: within a robust standard deviation of the
 # logarithms of its errors, where 84 % of its own tracks are. One more that is not is counted: a few may fit by chance.
-# On rendered actors the median is 2.7 to 12 standard deviations off, on what is masked by mistake 0.0 to 0.3.
+# On rendered shots 83 to 90 % of half an image that is masked by mistake come back so, and 14 % of an actor who hardly
+# moves, where the cameras are as exact as without him.
 _EXACT, _SHARE = 1.0, 0.5
 _LEAST_SPREAD = 0.1  # of the logarithms of the scene's errors
 
 
-def agreeing(observations: Observations, errors: Array, suspected: Flags, spreads: float) -> Flags:
+def agreeing(observations: Observations, errors: Array, suspected: Flags) -> Flags:
     """(n,) which points agree with the scene; all that are not suspected count as the scene.
 
     Args:
         errors: (m,) reprojection errors of the observations, under poses from the scene alone.
         suspected: (n,) which points are.
-        spreads: robust standard deviations of the logarithms of the scene's errors, up to which a point fits.
     """
     if not suspected.any() or suspected.all():
         return ~suspected
     size = np.log(np.sqrt(observations.mean_by_point(errors**2)) + 1e-6)
     center = np.median(size[~suspected])
     spread = 1.4826 * np.median(np.abs(size[~suspected] - center))
-    off = (size[suspected] - center) / max(spread, _LEAST_SPREAD)
+    exact = size[suspected] < center + _EXACT * max(spread, _LEAST_SPREAD)
     result = ~suspected
-    result[suspected] = (off < spreads) & (_share_nearby(_places(observations)[suspected], off < _EXACT) > _SHARE)
+    result[suspected] = exact & (_share_nearby(_places(observations)[suspected], exact) > _SHARE)
     return result
 
 

@@ -197,7 +197,7 @@ def _with_fitting_tracks(
         state, observations, replace(options, iterations=4), solved.errors, free=Free(cameras=False)
     )
     state, errors = adjustment.solve(), adjustment.reprojection_errors()
-    agree = agreeing(observations, errors, np.isin(tracks, suspects), options.outlier_sigmas)
+    agree = agreeing(observations, errors, np.isin(tracks, suspects))
     if not agree.all():
         kept = np.flatnonzero(agree)
         state, tracks, errors = state.of(kept), tracks[kept], errors[agree[observations.point]]

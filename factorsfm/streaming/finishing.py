@@ -81,6 +81,12 @@ class EndedShot:
             seconds=dict(self.seconds),
             options=self.options.to_dict(),
         )
+        if len(self.suspects):
+            agree = int(np.isin(polished.tracks, self.suspects).sum())
+            result.notes.append(
+                f"Tracks that a network takes for what moves: {len(self.suspects)}; {agree} of them agree with the "
+                "scene and take part."
+            )
         if self.without_depth:
             count, first = len(self.without_depth), next(iter(self.without_depth.values()))
             result.notes.append(f"Frames that went without depth because the prior failed: {count}; {first}.")
