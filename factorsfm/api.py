@@ -61,7 +61,7 @@ def reconstruct(
         camera: the lens, or its JSON file; None takes EXIF or a guess.
         depth: a network (ONNX file), a named model, a folder of maps, any `DepthPrior`, or None.
         depth_kind: what the prior holds, where it cannot be known.
-        masks: a folder, a segmentation network, any `MaskPrior`, or None.
+        masks: a folder, "people" or "movable", another segmentation network, any `MaskPrior`, or None.
         frames: range of the source's frames.
         preset: see `options.PRESETS`.
         lens: what of the lens is estimated where the shot determines it, see `Options`.

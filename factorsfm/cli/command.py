@@ -64,8 +64,9 @@ def add_method(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--masks",
-        metavar="FOLDER|MODEL.onnx|none",
-        help="what moves and is to be ignored: non-zero in the masks (default: none)",
+        metavar="FOLDER|people|movable|MODEL.onnx|none",
+        help="what moves: a folder of masks, in which non-zero is ignored; or what a network sees, whose tracks count "
+        "only if they agree with the rest: people (with animals), or movable (with vehicles, too) (default: none)",
     )
     parser.add_argument(
         "--lens",

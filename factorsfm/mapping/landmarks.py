@@ -16,6 +16,8 @@ from factorsfm.mapping.incremental import add_points, triangulate_tracks
 from factorsfm.mapping.map_copy import MapCopy, MapUpdate
 from factorsfm.mapping.mapped_images import MappedImage, state_of
 from factorsfm.mapping.point_map import PointMap
+from factorsfm.mapping.triangulation import triangulate
+from factorsfm.motion.suspects import agreeing
 from factorsfm.support.options import MapperOptions, PolishOptions
 from factorsfm.tracks.image_tracks import seen_by
 
@@ -26,6 +28,7 @@ _GROSS = 4.0  # times the threshold of an inlier: a young map is wrong, too, and
 _REACH = 60  # images to both sides of a lost one from which its tracks are triangulated
 _FARTHEST = 1e-6  # smallest inverse distance of a point
 _ALONE_ITERATIONS = 4
+_JUDGED_VIEWS = 3  # keyframes that must see a suspect: two leave its depth a free choice
 _SOLVER = replace(PolishOptions(), tolerance=1e-3)
 
 
@@ -79,6 +82,38 @@ def map_tracks(
     near = min(registered, key=lambda other: abs(other.tracks.position - position))
     shared = np.intersect1d(near.tracks.ids, image.tracks.ids, assume_unique=True)
     return add_tracks(points, registered, near, shared, options, focal) > 0
+
+
+def agreeing_tracks(
+    images: Sequence[MappedImage], points: PointMap, suspects: Index, focal: float, options: MapperOptions
+) -> tuple[Index, NDArray[np.bool_]]:
+    """Which suspected tracks agree with the map, under the poses of some registered images.
+
+    Args:
+        suspects: (n,) ids, ascending; focal: pixels.
+
+    Returns:
+        The ids (m,) of those of them that enough of the images see, and whether they agree.
+    """
+    seen = [image.tracks for image in images]
+    judged = np.intersect1d(seen_by(seen, _JUDGED_VIEWS), suspects)
+    scene = np.setdiff1d(seen_by(seen, 2), suspects)
+    scene = scene[points.contains(scene)]
+    if not len(judged) or not len(scene):
+        return judged, np.zeros(len(judged), bool)
+    ids = np.union1d(scene, judged)
+    suspected = np.isin(ids, judged)
+    observations, cameras = gather(seen, ids, focal), state_of(images, points.at(scene), focal)
+    bearing, inverse = np.empty((len(ids), 3)), np.empty(len(ids))
+    bearing[~suspected], inverse[~suspected] = cameras.bearing, cameras.inverse_distance
+    found = triangulate(
+        cameras, observations.of(np.flatnonzero(suspected)), inlier_px=options.inlier_px, sigma=options.pixel_sigma,
+        fallback=np.full(len(judged), float(np.median(cameras.inverse_distance))),
+    )  # fmt: skip
+    bearing[suspected], inverse[suspected] = found.bearing, found.inverse_distance
+    state = replace(cameras, bearing=bearing, inverse_distance=inverse)
+    errors = BundleAdjustment(state, observations, _SOLVER, ErrorModel(options.pixel_sigma)).reprojection_errors()
+    return judged, agreeing(observations, errors, suspected)[suspected]
 
 
 def _add_points(

@@ -55,6 +55,7 @@ def polish(
     factors: ShotFactors | None = None,
     first_focal: tuple[Array, float] | None = None,
     recording: Recording | None = None,
+    suspects: Index | None = None,
 ) -> Polished:
     """Triangulate all tracks and minimise over all registered frames.
 
@@ -67,6 +68,7 @@ def polish(
         first_focal: the focal lengths as they were known first, as in `estimate_lens`; None: `focal`.
         recording: of which the images are all, if their rows may have been read one after another; None: all at once,
             or in no order of time.
+        suspects: ids (ascending) of tracks that count only where they agree with the others.
         control: known poses, points and lengths; it takes part at the end, and only where the camera moves.
         factors: of the caller, where there is no control; they take part as it does.
 
@@ -74,7 +76,7 @@ def polish(
         ReconstructionError: hardly any tracks are left that connect frames, or the control does not determine where its
             world is.
     """
-    shot = Shot.of(images, map_points, focal, shape, groups, first_focal, recording)
+    shot = Shot.of(images, map_points, focal, shape, groups, first_focal, recording, suspects)
     named = _named(shot, control, factors, options.polish.max_frames // 2)
     start, frames, left_out = _start(shot, options, named, progress)
     progress("polish: all tracks")
@@ -123,7 +125,7 @@ def _start(
         frames = sorted({*frames, *named(registered)})
         tracks = shot.long_tracks(frames, min(o.min_track_length, max(2, len(frames))))
         observations = shot.observations(frames, tracks)
-        unconnected = _unconnected(observations, frames, least)
+        unconnected = _unconnected(observations.of(shot.trusted(tracks)), frames, least)
         if not unconnected:
             start = polish_start(shot, frames, shot.swept(observations, frames, tracks), tracks, options, progress)
             unconnected = _unconnected(start.observations, frames, least)

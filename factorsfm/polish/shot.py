@@ -31,6 +31,7 @@ class Shot:
         group: (images,) which of its focal lengths is that of each image.
         first_focal: see `estimate_lens`.
         recording: of which the images are all, None if their rows were all read at once.
+        suspects: ids (ascending) of the tracks that take part only where they agree with the others.
     """
 
     images: list[MappedImage]
@@ -39,6 +40,7 @@ class Shot:
     group: Index
     first_focal: tuple[Array, float] | None
     recording: Recording | None
+    suspects: Index
 
     @classmethod
     def of(
@@ -50,6 +52,7 @@ class Shot:
         groups: Index | None,
         first_focal: tuple[Array, float] | None,
         recording: Recording | None,
+        suspects: Index | None,
     ) -> Shot:
         """A shot whose lens is estimated where a distortion is given: its tracks keep their distorted pixels then."""
         guess = Lens(focal)
@@ -57,7 +60,8 @@ class Shot:
             guess = Lens(focal, np.r_[distortion, np.zeros(2)])
             images = [replace(image, tracks=_distorted(image.tracks)) for image in images]
         group = np.zeros(len(images), np.int64) if groups is None else groups
-        return cls(images, map_points, guess, group, first_focal, recording)
+        suspects = np.zeros(0, np.int64) if suspects is None else suspects
+        return cls(images, map_points, guess, group, first_focal, recording, suspects)
 
     @property
     def registered(self) -> list[int]:
@@ -71,6 +75,10 @@ class Shot:
     def long_tracks(self, frames: Sequence[int], least: int) -> Index:
         """Ids (ascending) of the tracks that at least so many of the images see."""
         return seen_by(self.tracks(frames), least)
+
+    def trusted(self, tracks: Index) -> Index:
+        """Rows of the tracks that are not suspected."""
+        return np.flatnonzero(~np.isin(tracks, self.suspects))
 
     def observations(self, frames: Sequence[int], tracks: Index) -> Observations:
         """Of some tracks (ascending ids) in some images."""

@@ -20,6 +20,7 @@ from factorsfm.lens.zoom import find_zoom
 from factorsfm.mapping.triangulation import Triangulation, triangulate
 from factorsfm.motion.at_rest import Rest
 from factorsfm.motion.shot_kind import Motion, classify_motion
+from factorsfm.motion.suspects import agreeing
 from factorsfm.polish.camera_starts import best_solution, core_tracks, solution_from
 from factorsfm.polish.near_and_far import NearAndFar, near_and_far
 from factorsfm.polish.shot import Shot
@@ -96,14 +97,15 @@ def polish_start(
 
     progress("polish: points")
     part = core.adjustment.state if general else core.motion.rotation_only
-    fitting = _with_fitting_tracks(part, core, observations, tracks, options.polish)
+    fitting = _with_fitting_tracks(part, core, observations, tracks, shot.suspects, options.polish)
     return PolishStart(*fitting, core.adjustment.sigma, inflation, depths, core)
 
 
 def _solved_core(shot: Shot, frames: list[int], observations: Observations, tracks: Index, options: Options) -> Core:
     """Cameras, lens and shutter on the longest tracks."""
     o = options.polish
-    core = core_tracks(observations, len(frames), everywhere=options.estimates_lens)
+    trusted = shot.trusted(tracks)
+    core = trusted[core_tracks(observations.of(trusted), len(frames), everywhere=options.estimates_lens)]
     few = observations.of(core)
     guess = _first_guess(shot, frames, few, tracks[core], _world(observations))
     found = turning_reading(guess, few, options)
@@ -198,9 +200,9 @@ def _estimate_lens(
 
 
 def _with_fitting_tracks(
-    part: State, core: Core, observations: Observations, tracks: Index, options: PolishOptions
+    part: State, core: Core, observations: Observations, tracks: Index, suspects: Index, options: PolishOptions
 ) -> tuple[State, Observations, Index]:
-    """All points for the cameras of `part`, and the tracks that fit them."""
+    """All points for the cameras of `part`, and the tracks that fit them; of the suspects those that agree."""
     solved, points = core.adjustment, core.points
     with_ray = np.asarray(np.isfinite(solved.state.normalized(observations)).all(axis=1))
     if not with_ray.all():
@@ -211,6 +213,12 @@ def _with_fitting_tracks(
         state, observations, replace(options, iterations=4), solved.errors, free=Free(cameras=False)
     )
     state, errors = adjustment.solve(), adjustment.reprojection_errors()
+    agree = agreeing(observations, errors, np.isin(tracks, suspects))
+    if not agree.all():
+        kept = np.flatnonzero(agree)
+        state, tracks, errors = state.of(kept), tracks[kept], errors[agree[observations.point]]
+        points = np.searchsorted(kept, points)  # of the core, which has no suspects
+        observations = observations.of(kept)
     if options.observation_sigmas is None:
         # Where most of the core is left out, what moves by itself is what is usual.
         usual = points if core.moving > _MOSTLY_MOVING else np.arange(len(tracks))

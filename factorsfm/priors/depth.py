@@ -147,13 +147,14 @@ def open_depth(spec: str | Path | DepthPrior | None, kind: DepthKind | str | Non
         if kind is not None and kind is not spec.kind:
             raise InputError(f"the depth prior {spec.name} is of kind {spec.kind}, not {kind}")
         return spec
-    if str(spec) in MODELS or Path(spec).suffix.lower() == ".onnx":
+    named = [name for name, model in MODELS.items() if model.gives == "depth"]
+    if str(spec) in named or Path(spec).suffix.lower() == ".onnx":
         return DepthModel(spec, kind)
     if Path(spec).is_dir():
         return DepthFolder(spec, kind)
     raise InputError(
         f"no depth prior {spec}: expected an existing folder of depth maps, an .onnx file, "
-        f"a named network ({', '.join(MODELS)}) or none"
+        f"a named network ({', '.join(named)}) or none"
     )
 
 

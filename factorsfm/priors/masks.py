@@ -17,8 +17,14 @@ from factorsfm.priors.models import find_model
 from factorsfm.priors.networks import Network, NetworkSpec
 from factorsfm.support.errors import InputError, ModelError
 
-# Labels of PASCAL VOC that move: aeroplane, bicycle, boat, bus, car, cat, dog, horse, motorbike, person, train.
-MOVABLE_LABELS = frozenset({1, 2, 4, 6, 7, 8, 12, 13, 14, 15, 19})
+# Labels of PASCAL VOC that move: bird, cat, cow, dog, horse, person, sheep; and aeroplane, bicycle, boat, bus, car,
+# motorbike, train.
+PEOPLE_LABELS = frozenset({3, 8, 10, 12, 13, 15, 17})
+MOVABLE_LABELS = PEOPLE_LABELS | {1, 2, 4, 6, 7, 14, 19}
+
+# What the named segmentation network can be asked for.
+NAMED_MASKS = {"people": PEOPLE_LABELS, "movable": MOVABLE_LABELS}
+_NAMED_NETWORK = "deeplab"
 
 # How far masks grow, as a share of the image width: their outlines are not exact, and the window of a track reaches
 # across them.
@@ -27,7 +33,11 @@ DEFAULT_MARGIN = 0.006
 
 @runtime_checkable
 class MaskPrior(Protocol):
-    """A callable that gives the mask of a frame."""
+    """A callable that gives the mask of a frame.
+
+    What it marks is ignored, unless it has an attribute `soft` that is true: then a video's tracks on it are followed
+    and suspected, and those that agree with the rest of the scene take part after all (`streaming.suspicion`).
+    """
 
     def __call__(self, frame: Frame) -> NDArray[np.bool_] | None:
         """(h, w) in the size of the frame, True = ignore; None if it has no mask."""
@@ -91,11 +101,14 @@ class MaskModel:
 
     Attributes:
         name: name of the file.
+        soft: always true: a network takes statues, posters and parked cars for what moves.
 
     Raises:
         ModelError: the network cannot be found, fetched or loaded, or does not take one image.
         InputError: no labels, or a negative margin.
     """
+
+    soft = True
 
     def __init__(
         self,
@@ -138,10 +151,12 @@ def open_masks(spec: str | Path | MaskPrior | None) -> MaskPrior | None:
     """The mask prior that `spec` names.
 
     Args:
-        spec: a folder of masks, an ONNX file, "none" or None; a mask prior is returned as it is.
+        spec: a folder of masks, an ONNX file, "none" or None; "people" for the people and animals that the named
+            network sees, "movable" for vehicles, too; a mask prior is returned as it is.
 
     Raises:
         InputError: `spec` is none of these.
+        ModelError: the network cannot be found or loaded.
     """
     if spec is None or spec == "none":
         return None
@@ -149,11 +164,15 @@ def open_masks(spec: str | Path | MaskPrior | None) -> MaskPrior | None:
         if not isinstance(spec, MaskPrior):
             raise InputError(f"a mask prior must be callable with a frame, not {spec!r}")
         return spec
+    if str(spec) in NAMED_MASKS:
+        return MaskModel(_NAMED_NETWORK, labels=NAMED_MASKS[str(spec)])
     if Path(spec).suffix.lower() == ".onnx":
         return MaskModel(spec)
     if Path(spec).is_dir():
         return MaskFolder(spec)
-    raise InputError(f"no masks {spec}: expected an existing folder of masks, an .onnx file or none")
+    raise InputError(
+        f"no masks {spec}: expected an existing folder of masks, an .onnx file, {', '.join(NAMED_MASKS)} or none"
+    )
 
 
 def _checked_margin(margin: float) -> float:

@@ -1,7 +1,7 @@
 """Named networks: their source, their checksum and the folder that holds them.
 
 A named network is looked up in the folder that the environment variable ``FACTORSFM_MODELS`` names, then in the user's
-cache; if it is in neither, it is fetched. Its checksum is verified every time.
+cache; if it is in neither, it is fetched where a source is known. Its checksum is verified every time.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import logging
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import pooch
 
@@ -26,25 +27,38 @@ class NamedModel:
     """A network that users can name.
 
     Attributes:
+        gives: the option that takes its output, without the dashes.
         file: file name, the same in all folders and at its source.
-        url: where it is fetched from, pinned to one revision.
+        url: where it is fetched from, pinned to one revision; None where no source offers this file.
         sha256: hexadecimal digest of the file.
         license: licence of the weights.
+        origin: what the file was made from, where there is no `url`.
     """
 
+    gives: Literal["depth", "masks"]
     file: str
-    url: str
+    url: str | None
     sha256: str
     license: str
+    origin: str = ""
 
 
 MODELS: dict[str, NamedModel] = {
     "tcmonodepth": NamedModel(
+        gives="depth",
         file="tcmonodepth_tcsmallnet_192x320.onnx",
         url="https://raw.githubusercontent.com/royshil/obs-backgroundremoval/875ffda/data/models/"
         "tcmonodepth_tcsmallnet_192x320.onnx",
         sha256="902b886beaebd3f68deb40bab2fd636a0c112c1ef1cbdd15fa26e5c55b389b4d",
         license="MIT",
+    ),
+    "deeplab": NamedModel(
+        gives="masks",
+        file="deeplabv3_mnv2_dm05_pascal.onnx",
+        url=None,
+        sha256="e80797f7dd3219da414cb0db8898c21079af9340f737c4c008e5cfbe8192a5a1",
+        license="Apache-2.0",
+        origin="deeplabv3_mnv2_dm05_pascal_quant.tflite of google-coral/test_data at 104342d",
     ),
 }
 
@@ -111,6 +125,12 @@ def _verified(path: Path, name: str) -> Path:
 def _fetch(name: str) -> Path:
     model = MODELS[name]
     folder = cache_folder()
+    if model.url is None:
+        raise ModelError(
+            f"the network {name} is not on this machine and cannot be fetched: put {model.file} (SHA-256 "
+            f"{model.sha256[:12]}...) into the folder that {MODELS_VARIABLE} names or into {folder}, or convert "
+            f"{model.origin} to ONNX and pass --{model.gives} FILE.onnx"
+        )
     logger.info("fetching the network %s from %s to %s", name, model.url, folder)
     pooch.get_logger().setLevel(logging.WARNING)  # it would write progress to stderr
     try:
@@ -124,6 +144,7 @@ def _fetch(name: str) -> Path:
     except (OSError, ValueError) as error:  # no connection, an HTTP error, a wrong checksum, a read-only cache
         raise ModelError(
             f"the network {name} is not on this machine and could not be fetched ({type(error).__name__}): "
-            f"set {MODELS_VARIABLE} to a folder that holds {model.file}, or pass --depth FILE or --depth none"
+            f"set {MODELS_VARIABLE} to a folder that holds {model.file}, or pass --{model.gives} FILE or "
+            f"--{model.gives} none"
         ) from error
     return folder / model.file

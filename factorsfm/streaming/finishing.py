@@ -41,6 +41,7 @@ class EndedShot:
         depth: the prior; without_depth: why it failed, by the frame's index.
         control: what is known beforehand; imu: beside the stream.
         seconds: of the stages so far; that of the polish is added.
+        suspects: ids of the tracks that count only where they agree with the others.
     """
 
     frames: Sequence[SeenFrame]
@@ -54,6 +55,7 @@ class EndedShot:
     imu: ImuSource | None
     options: Options
     seconds: StageSeconds
+    suspects: NDArray[np.int64]
 
     def reconstruction(self, progress: Progress | None) -> Reconstruction:
         """Polish over all frames and tracks; errors as in `Stream.finish`."""
@@ -79,6 +81,12 @@ class EndedShot:
             seconds=dict(self.seconds),
             options=self.options.to_dict(),
         )
+        if len(self.suspects):
+            agree = int(np.isin(polished.tracks, self.suspects).sum())
+            result.notes.append(
+                f"Tracks that a network takes for what moves: {len(self.suspects)}; {agree} of them agree with the "
+                "scene and take part."
+            )
         if self.without_depth:
             count, first = len(self.without_depth), next(iter(self.without_depth.values()))
             result.notes.append(f"Frames that went without depth because the prior failed: {count}; {first}.")
@@ -103,6 +111,7 @@ class EndedShot:
             factors=factors,
             first_focal=(np.array([self.mapper.first_focal]), first_focal_std(self.camera, given=self.lens_given)),
             recording=self._recording(),
+            suspects=self.suspects,
         )
 
     def _recording(self) -> Recording | None:

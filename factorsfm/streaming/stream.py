@@ -44,6 +44,7 @@ from factorsfm.streaming.frame_update import (
 )
 from factorsfm.streaming.imu_source import ImuSource
 from factorsfm.streaming.snapshot import read_snapshot, write_snapshot
+from factorsfm.streaming.suspicion import Suspicion
 from factorsfm.streaming.view_finder import ViewFinder
 from factorsfm.support.context import Closing
 from factorsfm.support.errors import InputError, ModelError, ReconstructionError
@@ -68,7 +69,7 @@ class Stream(Closing):
         camera: the lens; None takes EXIF of the first frame's file or guesses a field of view, and refines it in
             `finish`.
         depth: prior, or None.
-        masks: what to ignore, or None.
+        masks: what to ignore, or to suspect where they are soft (`MaskPrior`), or None.
         options: see `Options`; None is the default preset.
         control: what is known beforehand of poses and points; it takes part in `finish`. Not part of snapshots.
         imu: recording of an IMU on the camera, which gives metric scale and gravity; the frames need times. With it the
@@ -100,10 +101,10 @@ class Stream(Closing):
         self.seconds = StageSeconds()
         self.frames: list[SeenFrame] = []
         self._depth = depth if self.options.uses_depth else None
-        self._masks = masks
         self._held = ExitStack()
         self._closed = False
         self._tracker = self._held.enter_context(FlowTracker(self.options.tracker))
+        self._suspicion = self._held.enter_context(Suspicion(masks, self.options.mapper.min_tracks))
         self._finder = ViewFinder(self._tracker)
         self._thumbnails = self._held.enter_context(Thumbnails())
         self._graph = self._held.enter_context(GraphProcess())  # it starts while the source opens
@@ -132,7 +133,7 @@ class Stream(Closing):
         focal_changed = self._follow_focal(mapper)
         check_size(frame, self._size)
         with self.seconds.of("masks"):
-            mask = read_mask(self._masks, frame)
+            mask = read_mask(self._suspicion.sure, frame)
         with self.seconds.of("tracking"):
             grey = np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY), np.uint8)
             tracked = self._tracker.track(grey, mask, self._finder.expected(mapper))
@@ -143,6 +144,8 @@ class Stream(Closing):
         index = self._indices.take(frame.index)
         tracks = ImageTracks(len(self.frames), tracked.ids, tracked.xy, self.camera, index=index)
         tracks = tracks.of(tracks.invertible & (tracked.texture >= BLANK_TEXTURE))  # a blank image's tracks are noise
+        with self.seconds.of("masks"):
+            tracks = self._suspicion.of_scene(frame, tracks, mapper)
         with self.seconds.of("mapping"):
             if self._imu is not None:
                 keyframe |= self._imu.wants_keyframe(mapper, time)
@@ -255,6 +258,7 @@ class Stream(Closing):
                 "next_view": self._finder.relocalizer.next_view,
                 "mapper": self._mapper.state() if self._mapper is not None else None,
                 "imu": self._imu.state() if self._imu is not None else None,
+                "suspicion": self._suspicion.state(),
             },
         )
 
@@ -299,6 +303,7 @@ class Stream(Closing):
             self._mapper = self._new_mapper()
             self._mapper.restore(state["mapper"])
             self._indices = FrameIndices(image.tracks.frame for image in self._mapper.images)
+        self._suspicion.restore(state["suspicion"])
         if state["imu"] is not None:
             if self._imu is None:
                 raise InputError("the snapshot is of a stream with an IMU; its recording must be given, too")
@@ -327,23 +332,16 @@ class Stream(Closing):
             raise ReconstructionError(f"frames in the shot: {len(self.frames)}, at least 2 needed")
         with self.seconds.of("mapping"):
             self._mapper.finish(self._imu.finish if self._imu is not None else lambda mapper: None)
+            suspects = self._suspicion.end(self._mapper)
         self._follow_focal(self._mapper)
         for position, seen in enumerate(self.frames):
             mark_blank(self._mapper, position, seen.texture)
         assert self.camera is not None
         return EndedShot(
-            frames=self.frames,
-            mapper=self._mapper,
-            colors=self._colors.table,
-            camera=self.camera,
-            lens_given=self._lens_given,
-            depth=self._depth,
-            without_depth=self._without_depth,
-            control=self.control,
-            imu=self._imu,
-            options=self.options,
-            seconds=self.seconds,
-        )
+            frames=self.frames, mapper=self._mapper, colors=self._colors.table, camera=self.camera,
+            lens_given=self._lens_given, depth=self._depth, without_depth=self._without_depth, control=self.control,
+            imu=self._imu, options=self.options, seconds=self.seconds, suspects=suspects,
+        )  # fmt: skip
 
     def close(self) -> None:
         """End all threads and processes of the stream, with a result or without; `finish` closes, too."""

@@ -11,6 +11,7 @@ from onnx import TensorProto, helper
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.reading import read_frames
 from factorsfm.priors import MaskFolder, MaskModel, NetworkSpec, open_masks
+from factorsfm.priors.masks import MOVABLE_LABELS, PEOPLE_LABELS
 from factorsfm.support.errors import InputError, ModelError
 from tests.networks import save_network
 
@@ -184,8 +185,37 @@ def test_open_masks(tmp_path: Path) -> None:
     assert isinstance(open_masks(save_network(tmp_path / "deeplab.onnx", [1, 8, 8, 3])), MaskModel)
 
 
+def test_people_by_name(shared_models: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("FACTORSFM_MODELS", str(shared_models))
+    people, movable = open_masks("people"), open_masks("movable")
+    assert isinstance(people, MaskModel)
+    assert isinstance(movable, MaskModel)
+    assert people.name == movable.name == "deeplabv3_mnv2_dm05_pascal.onnx"
+    assert people.soft
+    assert not getattr(MaskFolder, "soft", False)
+    (tmp_path / "deeplabv3_mnv2_dm05_pascal.onnx").write_bytes(b"another network")
+    monkeypatch.setenv("FACTORSFM_MODELS", str(tmp_path))
+    with pytest.raises(ModelError, match=r"pascal\.onnx is not the network deeplab: .* expected e80797f7dd32"):
+        open_masks("people")
+
+
+@pytest.mark.parametrize(("labels", "marked"), [(PEOPLE_LABELS, {15}), (MOVABLE_LABELS, {7, 15})])
+def test_people_are_no_vehicles(tmp_path: Path, labels: frozenset[int], marked: set[int]) -> None:
+    nodes = [
+        helper.make_node("Gather", ["image", "zero"], ["red"], axis=1),
+        helper.make_node("Cast", ["red"], ["out"], to=TensorProto.INT64),
+    ]
+    path = save_network(tmp_path / "labels.onnx", [1, 3, 48, 64], nodes, output_type=TensorProto.INT64)
+    frame = label_image()
+    frame.image[40:, :, 2] = 7  # a car
+    found = MaskModel(path, NetworkSpec(value_max=255.0), labels, margin=0.0)(frame)
+    assert set(frame.image[..., 2][found].tolist()) == marked
+
+
 def test_open_masks_refuses_anything_else(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"expected an existing folder of masks, an \.onnx file or none"):
+    with pytest.raises(
+        InputError, match=r"expected an existing folder of masks, an \.onnx file, people, movable or none"
+    ):
         open_masks(tmp_path / "missing")
     with pytest.raises(InputError, match="must be callable with a frame, not 3"):
         open_masks(3)  # type: ignore[arg-type]

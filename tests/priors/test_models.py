@@ -105,6 +105,16 @@ def test_without_network_the_message_says_what_to_do(cache: Path) -> None:
     assert not list(cache.glob("*"))
 
 
+def test_a_network_without_a_source_says_where_its_file_belongs(cache: Path) -> None:
+    with pytest.raises(ModelError) as caught:
+        models.find_model("deeplab")
+    message = str(caught.value)
+    assert "\n" not in message
+    assert f"put {models.MODELS['deeplab'].file} (SHA-256 e80797f7dd32...)" in message
+    assert f"into the folder that FACTORSFM_MODELS names or into {cache}" in message
+    assert "pass --masks FILE.onnx" in message
+
+
 def test_named_network_is_fetched_once(cache: Path, server: Path, shared_models: Path) -> None:
     shutil.copy(shared_models / FILE, server / FILE)
     assert models.find_model(NAME) == cache / FILE
