@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     import pycolmap
 from factorsfm.control.fit import ControlFit
 from factorsfm.inertial.fit import ImuFit
+from factorsfm.objects.object_result import ObjectResult
 from factorsfm.polish.observability import CameraObservability
 from factorsfm.support.status import FrameStatus, ShotKind
 
@@ -174,6 +175,7 @@ class Reconstruction:
         metric: whether the world unit is the metre (from a metric prior, or from control).
         control: how well the control is met, or factors that were added; None without either.
         imu: what an IMU has given, None without one that took part.
+        objects: things that move by themselves and were asked for, as far as they could be solved.
         notes: sentences for the user (translation unobservable, focal length guessed, ...).
         seconds: wall time by stage.
         options: all options as plain data.
@@ -200,6 +202,7 @@ class Reconstruction:
     metric: bool = False
     control: ControlFit | None = None
     imu: ImuFit | None = None
+    objects: tuple[ObjectResult, ...] = ()
     notes: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
     options: dict[str, Any] = field(default_factory=dict)

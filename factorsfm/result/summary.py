@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from factorsfm.camera.files import camera_to_json
+from factorsfm.objects.object_result import ObjectResult
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.support.program import PROGRAM, program_version
 from factorsfm.support.status import ShotKind
@@ -34,6 +35,7 @@ def summary(reconstruction: Reconstruction) -> dict[str, Any]:
         "metric": reconstruction.metric,
         "control": reconstruction.control and asdict(reconstruction.control),
         "imu": reconstruction.imu and asdict(reconstruction.imu),
+        "objects": [_object_json(found) for found in reconstruction.objects],
         "reprojection_error": median_reprojection_error(reconstruction),
         "observability": pooled_observability(reconstruction),
         "focal_length": reconstruction.camera.mean_focal_length(),
@@ -132,6 +134,17 @@ def pooled_observability(reconstruction: Reconstruction) -> dict[str, float] | N
 def with_total(seconds: Mapping[str, float]) -> dict[str, float]:
     """The seconds by stage, with their sum as "total" if there is no total yet."""
     return {**seconds, "total": seconds.get("total", sum(seconds.values()))}
+
+
+def _object_json(found: ObjectResult) -> dict[str, Any]:
+    """In brief; objects.json has all of it."""
+    return {
+        "name": found.name,
+        "frames": len(found.frames),
+        "points": len(found.points),
+        "scale_std": found.scale_std,
+        "reprojection_error": found.reprojection_error,
+    }
 
 
 def _frame_json(frame: FrameResult) -> dict[str, Any]:
