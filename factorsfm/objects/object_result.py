@@ -49,3 +49,10 @@ class ObjectResult:
     reprojection_error: float
     scale_std: float | None
     note: str
+
+    @property
+    def rotation_std(self) -> float:
+        """Standard deviation of the rotation since the first frame, in the worst frame and about the worst axis,
+        degrees."""
+        turns = np.array([frame.covariance[:3, :3] for frame in self.frames])
+        return float(np.degrees(np.sqrt(np.linalg.eigvalsh(turns).max())))

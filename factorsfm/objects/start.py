@@ -36,8 +36,9 @@ LEAST_TRACKS = 20  # of a frame; with fewer, a pose is hardly more than a guess
 _FRAMES, _TRACKS, _LEAST_VIEWS = 10, 150, 3  # of the start: they decide which way the thing turns, no more
 _TURNS_DEG = (20.0, 60.0)  # by which the thing turns in these frames; starts half as far away still arrive
 _ROUGH, _FINE = 12, 60  # iterations
-_CANDIDATES = 4  # that are converged
+_CANDIDATES = 8  # that are converged
 _WIDE_PX = 0.5  # noise that is assumed first: the kernel is then as wide as a wrong start needs
+_DEVIATIONS = np.sqrt(12.0)  # standard deviations in the width of what is spread evenly
 _OTHER_DEG = 8.0  # by which solutions differ that are not the same
 
 
@@ -47,13 +48,16 @@ class ObjectStart:
 
     Attributes:
         images: their tracks; ids: (n,) of the points of `state`.
-        margin: cost of the best solution that turns otherwise, over that of this one; infinite if there is none.
+        margin: by how much the logarithm of the probability of this solution is larger than that of the best one that
+            turns otherwise; infinite if there is none.
+        perspective: how much larger the near side of a thing as deep as it is wide is than the far side, pixels.
     """
 
     images: list[ImageTracks]
     ids: Index
     state: State
     margin: float
+    perspective: float
 
 
 def object_start(images: Sequence[ImageTracks], turns: Array, options: PolishOptions) -> ObjectStart | None:
@@ -70,11 +74,8 @@ def object_start(images: Sequence[ImageTracks], turns: Array, options: PolishOpt
     ids = _longest(few)
     focal = np.array([image.camera.mean_focal_length() for image in few])
     observations = gather(few, ids, focal)
-    counted = len(observations.frame)
-    extent = float(np.hypot(*(np.quantile(observations.pixels, 0.9, 0) - np.quantile(observations.pixels, 0.1, 0))))
-    # A thing is about as deep as it is wide: without that, its depth may grow without bound in a wrong solution.
-    # (The extent includes the way of the thing through the image, and is no less for it.)
-    options = replace(options, point_sigma=min(options.point_sigma, extent / float(np.median(focal))))
+    width = _width(observations, focal)
+    options = replace(options, point_sigma=min(options.point_sigma, width))
     rough = [_solved(start, observations, options, _WIDE_PX, _ROUGH) for start in _starts(turns, observations, focal)]
     rough.sort(key=lambda solved: solved.cost())
     found = []
@@ -83,12 +84,18 @@ def object_start(images: Sequence[ImageTracks], turns: Array, options: PolishOpt
         sigma = coordinate_sigma(wide.reprojection_errors())
         found.append(_solved(wide.state, observations, options, sigma, _FINE))
     sigma = max(SMALLEST_SIGMA_PX, min(coordinate_sigma(solved.reprojection_errors()) for solved in found))
-    costs = [bounded_cost(solved, sigma, counted) for solved in found]
+    # Errors of neighbouring tracks repeat themselves, and count as many times less.
+    inflation = min(solved.error_inflation() for solved in found)
+    costs = [
+        bounded_cost(solved, sigma, len(observations.frame)) / inflation + _shape_cost(solved.state, width)
+        for solved in found
+    ]
     best = found[int(np.argmin(costs))]
-    others = [cost for cost, solved in zip(costs, found, strict=True) if _largest_turn(solved.state, best.state)]
-    margin = min(others, default=np.inf) / max(min(costs), 1e-9)
-    logger.info("object: %d tracks in %d frames, %.3f px, margin %.2f", len(ids), len(few), sigma, margin)
-    return ObjectStart(few, ids, in_front(best.state), margin)
+    others = [cost for cost, solved in zip(costs, found, strict=True) if _turns_otherwise(solved.state, best.state)]
+    margin = min(others, default=np.inf) - min(costs)
+    logger.info("object: %d tracks in %d frames, %.3f px, margin %.1f", len(ids), len(few), sigma, margin)
+    perspective = float(_DEVIATIONS**2 * width**2 * np.median(focal))
+    return ObjectStart(few, ids, in_front(best.state), margin, perspective)
 
 
 def _best_window(images: Sequence[ImageTracks]) -> Index | None:
@@ -148,7 +155,20 @@ def _solved(
     return solved
 
 
-def _largest_turn(state: State, other: State) -> bool:
+def _width(observations: Observations, focal: Array) -> float:
+    """Typical standard deviation of the places of the tracks in a frame, over the focal length."""
+    o = observations
+    spread = [np.sqrt(o.pixels[o.frame == row].var(0).mean()) for row in range(len(focal))]
+    return float(np.median(np.array(spread) / focal))
+
+
+def _shape_cost(state: State, width: float) -> float:
+    """Of how deep a thing is: a thing is about as deep as it is wide, and a wrong solution often several times so."""
+    relief = state.inverse_distance / np.median(state.inverse_distance) - 1.0
+    return 0.5 * float(((relief / width) ** 2).sum())
+
+
+def _turns_otherwise(state: State, other: State) -> bool:
     """Whether two solutions turn differently."""
     difference = np.einsum("kji,kjl->kil", state.rotation, other.rotation)
     cosine = 0.5 * (np.trace(difference, axis1=1, axis2=2).min() - 1.0)

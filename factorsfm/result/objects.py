@@ -37,7 +37,10 @@ def add_objects(result: Reconstruction, observed: ObservedObjects, options: Opti
             result.notes.append(f"The object {name} is not solved: {error}.")
             continue
         solved.append(found)
-        result.notes.append(f"The object {name} is solved in {len(found.frames)} frames. {found.note}")
+        result.notes.append(
+            f"The object {name} is solved in {len(found.frames)} frames, its rotation known to "
+            f"{found.rotation_std:.2g} degrees (one standard deviation). {found.note}"
+        )
     result.objects = tuple(solved)
 
 

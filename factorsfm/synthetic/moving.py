@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
 from factorsfm.synthetic.room import MovingBox, Room
 from factorsfm.synthetic.scene import Floats, Motion, camera_path, room_camera
-from factorsfm.synthetic.shot import RenderedShot
+from factorsfm.synthetic.shot import RenderedShot, write_shot
 
 _FROM, _TO = np.array([-0.45, 0.12, 2.3]), np.array([0.4, 0.0, 2.0])  # world units, before all boxes of the room
 _BOB = np.array([0.0, 0.05, 0.08])  # amplitude beside the straight way from one to the other, world units
@@ -71,6 +73,19 @@ def render_moving(
         zoom=np.ones(frames),
     )
     return MovingShot(shot, [scene.box_mask(camera, pose) for scene, pose in views], world_from_box)
+
+
+def write_moving(moving: MovingShot, folder: str | Path) -> None:
+    """Write what `write_shot` writes, and the masks of the box as ``objects/box/%06d.png``.
+
+    Raises:
+        InputError: as `write_shot`.
+    """
+    folder = Path(folder)
+    write_shot(moving.shot, folder)
+    (folder / "objects" / "box").mkdir(parents=True, exist_ok=True)
+    for index, mask in enumerate(moving.masks):
+        cv2.imwrite(str(folder / "objects" / "box" / f"{index:06d}.png"), 255 * mask.astype(np.uint8))
 
 
 def _box_pose(time: float, turn: float) -> pycolmap.Rigid3d:
