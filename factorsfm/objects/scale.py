@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 _LEAST_VALUES = 5  # of a map on the object
+_LARGEST_STD = 0.5  # relative: beyond, the median depth of the scene says as much
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,7 +19,7 @@ class PriorOnScene:
     """What the scene says of the depth map of a frame: ``scale / z + shift`` predicts its inverse depth.
 
     Attributes:
-        scale, shift, scale_std, shift_std, sigma: as in `PriorFit`, which is one.
+        scale, shift, scale_std, shift_std, sigma, smooth: as in `PriorFit`.
     """
 
     scale: float
@@ -26,6 +27,7 @@ class PriorOnScene:
     scale_std: float
     shift_std: float
     sigma: float
+    smooth: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +56,7 @@ def scale_from_prior(
             the scene says of this map.
 
     Returns:
-        None where no map says anything of the object.
+        None where no map says anything of the object, or none says it to a half of it.
     """
     ratios, stds = [], []
     for inverse_depth, depth, prior in maps:
@@ -64,10 +66,11 @@ def scale_from_prior(
             continue
         near = float(np.median(inverse[good]))
         ratios.append(float(np.median(1.0 / (inverse[good] * depth[good]))))
-        errors = np.array([prior.sigma, prior.shift_std, prior.scale_std * near]) / (prior.scale * near)
+        errors = np.array([prior.sigma, prior.smooth, prior.shift_std, prior.scale_std * near]) / (prior.scale * near)
         stds.append(float(np.linalg.norm(errors)))
     if not ratios:
         return None
     value = float(np.median(ratios))
     spread = 1.4826 * float(np.median(np.abs(np.array(ratios) / value - 1.0)))
-    return Scale(value, max(float(np.median(stds)), spread), len(ratios))
+    std = max(float(np.median(stds)), spread)
+    return Scale(value, std, len(ratios)) if std < _LARGEST_STD else None

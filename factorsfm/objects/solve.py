@@ -170,4 +170,4 @@ def _note(scale: Scale | None) -> str:
             "Nothing gives its scale: it is put at the scene's median depth, and its size and path are known up to "
             "their distance from the camera."
         )
-    return f"Its scale comes from the depth prior on it in {scale.frames} frames: ± {100 * scale.std:.0f} %."
+    return f"Its scale comes from the depth prior on it ({scale.frames} maps): ± {100 * scale.std:.0f} %."

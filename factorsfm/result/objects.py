@@ -57,7 +57,7 @@ def _scene_cameras(result: Reconstruction) -> dict[int, SceneCamera]:
         depth = float(np.median((frame.cam_from_world * seen)[:, 2])) if len(seen) else everywhere
         prior = None
         if (fit := frame.prior) is not None:
-            prior = PriorOnScene(fit.scale, fit.shift, fit.scale_std, fit.shift_std, fit.sigma)
+            prior = PriorOnScene(fit.scale, fit.shift, fit.scale_std, fit.shift_std, fit.sigma, fit.smooth)
         cameras[position] = SceneCamera(frame.index, frame.cam_from_world, depth, prior)
     return cameras
 

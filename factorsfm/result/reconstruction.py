@@ -26,6 +26,8 @@ class PriorFit:
         scale, shift: in units of the prior's inverse depth (scale times the world unit).
         scale_std, shift_std: standard deviations from the polish.
         sigma: robust standard deviation of the residuals, in the prior's inverse depth.
+        smooth: standard deviation of the error that is smooth over the image, which the residuals do not have, in the
+            same unit; 0 if unknown.
     """
 
     scale: float
@@ -33,6 +35,7 @@ class PriorFit:
     scale_std: float
     shift_std: float
     sigma: float
+    smooth: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -168,6 +168,7 @@ def _frame_json(frame: FrameResult) -> dict[str, Any]:
             "shift": prior.shift,
             "shift_std": prior.shift_std,
             "sigma": prior.sigma,
+            "smooth": prior.smooth,
         },
         "observability": frame.observability and asdict(frame.observability),
         "focal_length": frame.camera and frame.camera.mean_focal_length(),

@@ -56,6 +56,6 @@ def moving_points(
         unit = float(np.median(inverse))
         depth = ImageDepth(inverse / unit, np.ones(POINTS), unit) if prior and k % 3 == 0 else None
         images.append(ImageTracks(k, np.arange(POINTS), pixels, camera, depth))
-        said = PriorOnScene(1.0, SHIFT, 0.01, 0.005, 0.02) if depth is not None else None
+        said = PriorOnScene(1.0, SHIFT, 0.01, 0.005, 0.02, 0.01) if depth is not None else None
         cameras[k] = SceneCamera(FRAME_STEP * k, cam_from_world, 4.0, said)
     return MovingPoints(poses, points, images, cameras)

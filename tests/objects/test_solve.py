@@ -143,7 +143,7 @@ def test_frames_without_a_camera_are_left_out() -> None:
 
 def maps(count: int, sigma: float, factor: float = 2.0) -> list[tuple[NDArray[np.float64], ...]]:
     depth = np.linspace(1.0, 1.2, 30)
-    prior = PriorOnScene(3.0, 0.5, 0.0, 0.0, sigma)
+    prior = PriorOnScene(3.0, 0.5, 0.0, 0.0, 0.8 * sigma, 0.6 * sigma)
     return [(3.0 / (factor * depth) + 0.5, depth, prior) for _ in range(count)]
 
 
@@ -164,6 +164,8 @@ def test_scale_that_changes_from_map_to_map_is_as_uncertain() -> None:
 def test_no_scale_from_maps_that_say_nothing() -> None:
     (inverse, depth, prior) = maps(1, 0.1)[0]
     assert scale_from_prior([]) is None
+    assert scale_from_prior(maps(4, 0.75)) is None  # to more than a half
+    assert scale_from_prior(maps(4, 0.6)) is not None
     assert scale_from_prior([(inverse[:4], depth[:4], prior)]) is None
     assert scale_from_prior([(0.0 * inverse, depth, prior)]) is None  # beyond infinity
     assert scale_from_prior([(inverse, depth, replace(prior, scale=-1.0))]) is None
