@@ -122,6 +122,18 @@ def test_a_small_thing_is_not_solved() -> None:
         solve_object("box", moving.images, COLORS, moving.cameras, Options())
 
 
+def test_two_motions_are_not_one_thing() -> None:
+    """Every third point goes its own way, up and down by a few pixels."""
+    moving = truth()
+    own = np.arange(POINTS) % 3 == 0
+    images = [
+        replace(image, pixels=image.pixels + np.outer(own, [0.0, 12.0 * np.sin(1.3 * image.position)]))
+        for image in moving.images
+    ]
+    with pytest.raises(ReconstructionError, match=r"^it is not rigid: one motion explains (5\d|60) of 90 tracks"):
+        solve_object("box", images, COLORS, moving.cameras, Options())
+
+
 def test_too_few_tracks_and_frames() -> None:
     moving = truth()
     with pytest.raises(ReconstructionError, match=r"^4 frames have 20 tracks on it, at least 5 needed$"):
