@@ -75,7 +75,7 @@ def solve_object(
     turns = np.array([cameras[image.position].cam_from_world.rotation.matrix() for image in images])
     start = object_start(images, turns, options.polish)
     if start is None:
-        raise ReconstructionError(f"no two frames share {LEAST_TRACKS} tracks on it")
+        raise ReconstructionError(f"no three frames share {LEAST_TRACKS} tracks on it")
     if start.perspective < _LEAST_PERSPECTIVE_PX:
         raise ReconstructionError(
             f"it is too small in the image: perspective changes its size by {start.perspective:.1f} pixels, "

@@ -34,6 +34,7 @@ logger = logging.getLogger(__name__)
 
 LEAST_TRACKS = 20  # of a frame; with fewer, a pose is hardly more than a guess
 _FRAMES, _TRACKS, _LEAST_VIEWS = 10, 150, 3  # of the start: they decide which way the thing turns, no more
+_LEAST_SEEN = 6  # of these tracks in each of these frames: a pose has six variables, and twice as many are seen
 _TURNS_DEG = (20.0, 60.0)  # by which the thing turns in these frames; starts half as far away still arrive
 _ROUGH, _FINE = 12, 60  # iterations
 _CANDIDATES = 8  # that are converged
@@ -61,7 +62,7 @@ class ObjectStart:
 
 
 def object_start(images: Sequence[ImageTracks], turns: Array, options: PolishOptions) -> ObjectStart | None:
-    """The best start; None where no two frames have enough tracks in common.
+    """The best start; None where no few frames have enough tracks in common.
 
     Args:
         images: that see the object; turns: (images, 3, 3) rotations cam_from_world of the scene, which an object that
@@ -74,6 +75,8 @@ def object_start(images: Sequence[ImageTracks], turns: Array, options: PolishOpt
     ids = _longest(few)
     focal = np.array([image.camera.mean_focal_length() for image in few])
     observations = gather(few, ids, focal)
+    if len(ids) < LEAST_TRACKS or np.bincount(observations.frame, minlength=len(few)).min() < _LEAST_SEEN:
+        return None
     width = _width(observations, focal)
     options = replace(options, point_sigma=min(options.point_sigma, width))
     rough = [_solved(start, observations, options, _WIDE_PX, _ROUGH) for start in _starts(turns, observations, focal)]

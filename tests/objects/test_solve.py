@@ -139,7 +139,7 @@ def test_too_few_tracks_and_frames() -> None:
     with pytest.raises(ReconstructionError, match=r"^4 frames have 20 tracks on it, at least 5 needed$"):
         solve_object("box", moving.images[:4], COLORS, moving.cameras, Options())
     torn = [replace(image, ids=image.ids + 1000 * image.position) for image in moving.images]
-    with pytest.raises(ReconstructionError, match="no two frames share 20 tracks"):
+    with pytest.raises(ReconstructionError, match="no three frames share 20 tracks"):
         solve_object("box", torn, COLORS, moving.cameras, Options())
 
 
