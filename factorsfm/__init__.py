@@ -22,10 +22,12 @@ from factorsfm.imagesets.add_images import add_images
 from factorsfm.inertial.fit import ImuFit
 from factorsfm.inertial.mounting import open_imu
 from factorsfm.inertial.recording import ImuNoise, ImuRecording
+from factorsfm.objects.object_result import ObjectFrame, ObjectResult
 from factorsfm.polish.observability import CameraObservability
 from factorsfm.priors.depth import DepthFolder, DepthModel, DepthPrior
 from factorsfm.priors.depth_map import DepthKind, DepthMap
 from factorsfm.priors.masks import MaskFolder, MaskModel, MaskPrior
+from factorsfm.priors.object_masks import ObjectFolder, ObjectMasks
 from factorsfm.result.reading import read_result
 from factorsfm.result.reconstruction import FrameResult, PriorFit, Reconstruction
 from factorsfm.streaming.episode import Episode, ShotResult
@@ -71,6 +73,10 @@ __all__ = [
     "MaskModel",
     "MaskPrior",
     "ModelError",
+    "ObjectFolder",
+    "ObjectFrame",
+    "ObjectMasks",
+    "ObjectResult",
     "Options",
     "PolishOptions",
     "PriorFit",

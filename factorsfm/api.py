@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
@@ -23,14 +24,18 @@ from factorsfm.imagesets.image_set import ImageSet
 from factorsfm.imagesets.photo_folder import work_folder
 from factorsfm.inertial.mounting import open_imu
 from factorsfm.inertial.recording import ImuRecording
+from factorsfm.objects.observed import ObservedObjects, RememberedDepth
 from factorsfm.priors.depth import DepthFolder, DepthPrior, open_depth
 from factorsfm.priors.depth_map import DepthKind
 from factorsfm.priors.masks import MaskFolder, MaskPrior, open_masks
+from factorsfm.priors.object_masks import ObjectFolder, ObjectMasks, open_objects
+from factorsfm.result.objects import add_objects
 from factorsfm.result.reconstruction import Reconstruction
 from factorsfm.streaming.stream import Stream
 from factorsfm.support.errors import InputError
 from factorsfm.support.options import LensFreedom, Options, ShutterUse
 from factorsfm.support.progress import Progress
+from factorsfm.support.threads import OneThreadEach
 
 
 def reconstruct(
@@ -40,6 +45,7 @@ def reconstruct(
     depth: str | Path | DepthPrior | None = "tcmonodepth",
     depth_kind: DepthKind | str | None = None,
     masks: str | Path | MaskPrior | None = None,
+    objects: str | Path | ObjectMasks | None = None,
     frames: slice | None = None,
     preset: str = "default",
     lens: LensFreedom = "auto",
@@ -62,6 +68,8 @@ def reconstruct(
         depth: a network (ONNX file), a named model, a folder of maps, any `DepthPrior`, or None.
         depth_kind: what the prior holds, where it cannot be known.
         masks: a folder, "people" or "movable", another segmentation network, any `MaskPrior`, or None.
+        objects: masks of rigid things in a video that move by themselves and are solved, too: a folder (`ObjectFolder`)
+            or any `ObjectMasks`; the scene ignores them. They are `Reconstruction.objects` of the result.
         frames: range of the source's frames.
         preset: see `options.PRESETS`.
         lens: what of the lens is estimated where the shot determines it, see `Options`.
@@ -87,7 +95,7 @@ def reconstruct(
     camera = open_camera(camera)
     frames = checked_range(frames) if frames is not None else None
     prior = open_depth(depth, depth_kind) if options.uses_depth else None
-    mask_prior = open_masks(masks)
+    mask_prior, object_masks = open_masks(masks), open_objects(objects)
     known = read_control(control) if isinstance(control, str | Path) else control
     recording = open_imu(imu) if isinstance(imu, str | Path) else imu
     _check_control(known, source, frames)
@@ -95,14 +103,19 @@ def reconstruct(
         unordered = isinstance(source, str | Path) and looks_unordered(Path(source), frames)
     if unordered and recording is not None:
         raise InputError("an IMU goes with a video; images in any order have no times")
+    if unordered and object_masks is not None:
+        raise InputError("objects are tracked in a video; images in any order show no motion")
     if unordered:
         result = _from_images(source, frames, camera, prior, mask_prior, options, known, features, work, progress)
     else:
-        result = _from_shot(source, frames, camera, prior, mask_prior, options, known, recording, progress)
+        result = _from_shot(
+            source, frames, camera, prior, mask_prior, object_masks, options, known, recording, progress
+        )
     said = {
         "source": str(source) if isinstance(source, str | Path) else "frames",
         "unordered": unordered,
         "features": str(features),
+        "objects": getattr(object_masks, "name", type(object_masks).__name__) if object_masks is not None else None,
         **input_options(prior, mask_prior, frames),
     }
     for part in (result, *result.others):
@@ -139,20 +152,36 @@ def _from_shot(
     camera: pycolmap.Camera | None,
     depth: DepthPrior | None,
     masks: MaskPrior | None,
+    objects: ObjectMasks | None,
     options: Options,
     control: Control | None,
     imu: ImuRecording | None,
     progress: Progress | None,
 ) -> Reconstruction:
-    with Stream(camera, depth=depth, masks=masks, options=options, control=control, imu=imu) as stream:
+    with ExitStack() as held:
+        seen, observed, shared = masks, None, depth
+        if objects is not None:
+            shared = remembered = RememberedDepth(depth) if depth is not None else None
+            seen = observed = held.enter_context(ObservedObjects(objects, masks, remembered, options.tracker))
+        stream = held.enter_context(Stream(camera, depth=shared, masks=seen, options=options, control=control, imu=imu))
         for done, frame in enumerate(read_frames(source, frames)):
             if progress is not None:
                 progress("frames", done, None)
             stream.push(frame)
+            if observed is not None:
+                with stream.seconds.of("objects"):
+                    observed.push(frame)
         if not stream.frames:
             raise InputError(f"no frames in {source}")
-        check_matched(source, depth, masks)
-        return stream.finish(progress)
+        check_matched(source, depth, masks, objects)
+        result = stream.finish(progress)
+        if observed is not None:
+            if progress is not None:
+                progress("objects", 0, None)
+            with stream.seconds.of("objects"), OneThreadEach():
+                add_objects(result, observed, options)
+            result.seconds["objects"] = stream.seconds["objects"]
+        return result
 
 
 def _from_images(
@@ -184,8 +213,10 @@ def _from_images(
         return result
 
 
-def check_matched(source: object, depth: DepthPrior | None, masks: MaskPrior | None) -> None:
+def check_matched(
+    source: object, depth: DepthPrior | None, masks: MaskPrior | None, objects: ObjectMasks | None = None
+) -> None:
     """After all frames: a folder of maps or masks of which none belongs to a frame is an InputError."""
-    for name, folder in (("depth map", depth), ("mask", masks)):
-        if isinstance(folder, DepthFolder | MaskFolder) and folder.asked and not folder.matched:
+    for name, folder in (("depth map", depth), ("mask", masks), ("mask of an object", objects)):
+        if isinstance(folder, DepthFolder | MaskFolder | ObjectFolder) and folder.asked and not folder.matched:
             raise InputError(f"no {name} in the given folder matches a frame of {source}")

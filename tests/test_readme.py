@@ -21,7 +21,7 @@ from factorsfm import PRESETS, DepthKind, FrameStatus, ShotKind, open_imu, read_
 from factorsfm.cli import main as cli
 from factorsfm.export import FORMATS
 from factorsfm.priors import models
-from factorsfm.synthetic import RenderedShot, render_shot, write_shot
+from factorsfm.synthetic import RenderedShot, render_moving, render_shot, write_moving, write_shot
 from tests.instruments import CHECKS, WALK_FRAMES, write_measurements, write_walk
 from tests.networks import save_network
 from tests.pages import ALL_PAGES, CONTRIBUTING, DOCS, PAGES, README, ROOT, rows, table, text_of
@@ -80,6 +80,7 @@ def material(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("readme")
     shot = shot_of_the_examples()
     write_shot(shot, folder)
+    write_moving(render_moving("truck", FRAMES, 256, 144, size=0.8), folder / "crossing")
     for name in ("images", "masks", "networks", "stills"):
         (folder / name).mkdir()
     mask = np.zeros((90, 160), np.uint8)
@@ -129,7 +130,8 @@ def test_command(block: Block, place: Path, monkeypatch: pytest.MonkeyPatch) -> 
         assert cli.main(words[1:]) == 0
         output = place / words[words.index("--output") + 1]
         if words[1] in ("reconstruct", "stream"):
-            assert {path.name for path in output.iterdir()} == FILES
+            own = {"objects.json"} if "--objects" in words else set()
+            assert {path.name for path in output.iterdir()} == FILES | own
             summary = json.loads((output / "summary.json").read_text())
             assert summary["registered"] == summary["frames"] == (WALK_FRAMES if "--imu" in words else FRAMES)
             assert ("--imu" in words) == (summary["imu"] is not None)
@@ -281,7 +283,7 @@ def test_the_readme_is_read_in_one_sitting() -> None:
 @pytest.mark.parametrize("page", [README, DOCS / "command-line.md"], ids=lambda page: page.name)
 def test_the_files_of_a_result_are_listed(page: Path) -> None:
     listed = {row["file"].split(",")[0].strip("`/") for row in table(text_of(page), "file")}
-    assert listed - {"part-002"} == FILES
+    assert listed - {"part-002", "objects.json"} == FILES
 
 
 def test_the_figures_are_those_of_the_benchmarks() -> None:

@@ -17,6 +17,7 @@ from factorsfm.frames.cuts import find_shots
 from factorsfm.frames.folders import list_files
 from factorsfm.frames.video import VIDEO_SUFFIXES
 from factorsfm.priors.masks import MaskFolder
+from factorsfm.priors.object_masks import ObjectFolder
 from factorsfm.support.errors import InputError
 from factorsfm.support.json_text import json_text
 from factorsfm.support.options import LensFreedom, ShutterUse
@@ -30,18 +31,21 @@ class Method:
     depth: str | None = None
     depth_kind: str | None = None
     masks: str | None = None
+    objects: str | None = None
     preset: str = "default"
     lens: LensFreedom = "auto"
     shutter: ShutterUse = "auto"
 
     def of_video(self, name: str) -> Method:
         """For one of several videos: with the folders of its maps and masks."""
-        depth, masks = self.depth, self.masks
+        depth, masks, objects = self.depth, self.masks, self.objects
         if depth is not None and Path(depth).is_dir():
             depth = str(Path(depth) / name)
         if masks is not None and Path(masks).is_dir():
             masks = str(Path(masks) / name) if (Path(masks) / name).is_dir() else None
-        return replace(self, depth=depth, masks=masks)
+        if objects is not None:
+            objects = str(Path(objects) / name) if (Path(objects) / name).is_dir() else None
+        return replace(self, depth=depth, masks=masks, objects=objects)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data."""
@@ -50,6 +54,7 @@ class Method:
             "depth": self.depth,
             "depth_kind": self.depth_kind,
             "masks": self.masks,
+            "objects": self.objects,
             "preset": self.preset,
             "lens": self.lens,
             "shutter": self.shutter,
@@ -156,6 +161,8 @@ def plan_jobs(shots: Mapping[Video, Sequence[range]], method: Method, output: Pa
             masked = masks is None or any(map(masks.has, frames))
             matched |= own.masks is not None and masked
             chosen = own if masked else replace(own, masks=None)
+            if own.objects is not None and not any(map(ObjectFolder(own.objects).has, frames)):
+                chosen = replace(chosen, objects=None)
             jobs.append(Job(video, frames, chosen, output.absolute() / video.name / f"shot_{number:03d}"))
     if method.masks is not None and not matched:
         raise InputError(f"no mask in {method.masks} matches a frame of a shot")

@@ -39,6 +39,7 @@ def reconstruct_shot(job: Job, *, one_thread: bool, progress: Progress | None = 
                 depth=method.depth,
                 depth_kind=method.depth_kind,
                 masks=method.masks,
+                objects=method.objects,
                 frames=slice(job.frames.start, job.frames.stop),
                 preset=method.preset,
                 lens=method.lens,

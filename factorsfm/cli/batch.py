@@ -14,10 +14,11 @@ from factorsfm.batch.index import Entry, Index, shots_known
 from factorsfm.batch.plan import Job, Method, Video, find_videos, plan_jobs
 from factorsfm.batch.worker import find_shots_of, reconstruct_shot
 from factorsfm.camera.files import open_camera
-from factorsfm.cli.command import Command, add_method, add_output, count_of
+from factorsfm.cli.command import Command, add_method, add_objects, add_output, count_of
 from factorsfm.cli.progress_line import ProgressLine
 from factorsfm.priors.depth import open_depth
 from factorsfm.priors.masks import open_masks
+from factorsfm.priors.object_masks import open_objects
 from factorsfm.report.result_folder import check_directory, is_earlier_result, remove_result, write_failure
 from factorsfm.support.errors import FactorsfmError, InputError, ReconstructionError
 from factorsfm.support.json_text import json_text
@@ -34,6 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("source", metavar="SOURCE", help="a video file, or a folder of video files")
     add_output(parser, "folder of the results: new, empty, or that of an earlier run, which goes on")
     add_method(parser)
+    add_objects(parser)
     parser.add_argument(
         "--workers",
         type=count_of("processes"),
@@ -86,13 +88,17 @@ def _one_thread(workers: int, scheduler: str | None) -> bool:
 
 def _method(arguments: argparse.Namespace, *, several: bool) -> Method:
     """The arguments for all shots; opens camera, prior and masks once, to find errors before the work."""
-    depth, masks = _absolute(arguments.depth), _absolute(arguments.masks)
+    depth, masks, objects = map(_absolute, (arguments.depth, arguments.masks, arguments.objects))
     if Options.preset_named(arguments.preset).uses_depth and not (several and depth and Path(depth).is_dir()):
         open_depth(depth, arguments.depth_kind)
     if not (several and masks and Path(masks).is_dir()):
         open_masks(masks)
+    if not several:
+        open_objects(objects)
     camera = open_camera(arguments.camera)
-    return Method(camera, depth, arguments.depth_kind, masks, arguments.preset, arguments.lens, arguments.shutter)
+    return Method(
+        camera, depth, arguments.depth_kind, masks, objects, arguments.preset, arguments.lens, arguments.shutter
+    )
 
 
 def _absolute(text: str | None) -> str | None:

@@ -87,6 +87,16 @@ def add_method(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--preset", choices=list(PRESETS), default="default", help="default: %(default)s")
 
 
+def add_objects(parser: argparse.ArgumentParser) -> None:
+    """Declare the masks of objects."""
+    parser.add_argument(
+        "--objects",
+        metavar="FOLDER|none",
+        help="masks of rigid things that move by themselves, a subfolder for each or numbers in the masks: their "
+        "motion is solved, too (default: none)",
+    )
+
+
 def add_range(parser: argparse.ArgumentParser) -> None:
     """Declare the range of frames."""
     parser.add_argument("--frames", metavar="START:STOP[:STEP]", help="counted from 0, without STOP")

@@ -11,6 +11,7 @@ from factorsfm.camera.files import open_camera
 from factorsfm.cli.command import (
     Command,
     add_method,
+    add_objects,
     add_output,
     add_range,
     as_given,
@@ -28,6 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("source", metavar="SOURCE", help="a video file, or a folder of images")
     add_output(parser)
     add_method(parser)
+    add_objects(parser)
     add_range(parser)
     parser.add_argument(
         "--unordered",
@@ -73,6 +75,7 @@ def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
             depth=unless_none(arguments.depth),
             depth_kind=arguments.depth_kind,
             masks=unless_none(arguments.masks),
+            objects=unless_none(arguments.objects),
             frames=frames,
             preset=arguments.preset,
             lens=arguments.lens,

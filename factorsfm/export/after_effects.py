@@ -11,6 +11,9 @@ from factorsfm.export.shot import Shot
 
 CAMERA, FOOTAGE = "camera.txt", "footage.txt"
 
+_POSITION, _PIXELS = "Transform\tPosition", "X pixels\tY pixels\tZ pixels"
+_ORIENTATION, _DEGREES = "Transform\tOrientation", "X degrees\tY degrees\tZ degrees"
+
 
 def write_after_effects(shot: Shot, folder: Path) -> None:
     """Write ``camera.txt`` and ``footage.txt``, After Effects' keyframe data.
@@ -20,7 +23,7 @@ def write_after_effects(shot: Shot, folder: Path) -> None:
     from the top left corner, y down, z into the picture, with the origin of the world in the middle of the composition;
     orientation is in degrees (first z, then y, then x). In After Effects the optical axis goes through the middle of
     the composition and pixels are square. Where the lens differs, the second text moves and stretches the footage.
-    Distortion is not included. Unregistered frames have no key.
+    Distortion is not included. Unregistered frames have no key. The text of an object goes onto a 3-D null.
     """
     lens = shot.lens
     middle = np.array([lens.width / 2, lens.height / 2, 0.0])
@@ -28,19 +31,29 @@ def write_after_effects(shot: Shot, folder: Path) -> None:
     orientations = angles_zyx(shot.world_from_opencv[:, :3, :3])
     frames = shot.numbers
     camera = [
-        _track("Transform\tPosition", "X pixels\tY pixels\tZ pixels", frames, positions),
-        _track("Transform\tOrientation", "X degrees\tY degrees\tZ degrees", frames, orientations),
+        _track(_POSITION, _PIXELS, frames, positions),
+        _track(_ORIENTATION, _DEGREES, frames, orientations),
         _track("Camera Options\tZoom", "pixels", frames, np.array([[own.fx] for own in shot.lenses])),
     ]
     once = [shot.first]
     footage = [
-        _track("Transform\tAnchor Point", "X pixels\tY pixels\tZ pixels", once, np.array([[lens.cx, lens.cy, 0.0]])),
-        _track("Transform\tPosition", "X pixels\tY pixels\tZ pixels", once, middle[None]),
+        _track("Transform\tAnchor Point", _PIXELS, once, np.array([[lens.cx, lens.cy, 0.0]])),
+        _track(_POSITION, _PIXELS, once, middle[None]),
         _track(
             "Transform\tScale", "X percent\tY percent\tZ percent", once, np.array([[100, 100 / lens.pixel_aspect, 100]])
         ),
     ]
-    for name, tracks in ((CAMERA, camera), (FOOTAGE, footage)):
+    objects = [
+        (
+            f"{thing.name}.txt",
+            [
+                _track(_POSITION, _PIXELS, thing.numbers, thing.world_from_object[:, :3, 3] + middle),
+                _track(_ORIENTATION, _DEGREES, thing.numbers, angles_zyx(thing.world_from_object[:, :3, :3])),
+            ],
+        )
+        for thing in shot.objects
+    ]
+    for name, tracks in ((CAMERA, camera), (FOOTAGE, footage), *objects):
         # Line ends as in After Effects' own keyframe data.
         (folder / name).write_text(_keyframe_data(shot, tracks), encoding="ascii", newline="\r\n")
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 
 from factorsfm.export.footage import Sequence, background
 from factorsfm.export.shot import Shot
@@ -48,7 +49,20 @@ for frame, location, rotation in zip(DATA["frames"], DATA["locations"], DATA["ro
 for frame, focal_length in zip(DATA["frames"], DATA["focal_lengths"]):  # of a zoom
     lens.lens = focal_length
     lens.keyframe_insert("lens", frame=frame)
-for action in [data.animation_data.action for data in (camera, lens) if data.animation_data]:
+
+moving = []
+for thing in DATA["objects"]:
+    null = bpy.data.objects.new(thing["name"], None)
+    null.rotation_mode = "QUATERNION"
+    collection.objects.link(null)
+    for frame, location, rotation in zip(thing["frames"], thing["locations"], thing["rotations"]):
+        null.location = location
+        null.rotation_quaternion = rotation
+        null.keyframe_insert("location", frame=frame)
+        null.keyframe_insert("rotation_quaternion", frame=frame)
+    moving.append(null)
+
+for action in [data.animation_data.action for data in (camera, lens, *moving) if data.animation_data]:
     if hasattr(action, "fcurves"):
         curves = list(action.fcurves)
     else:  # since Blender 5
@@ -57,12 +71,18 @@ for action in [data.animation_data.action for data in (camera, lens) if data.ani
     for key in [key for curve in curves for key in curve.keyframe_points]:
         key.interpolation = "LINEAR"
 
-mesh = bpy.data.meshes.new("factorsfm points")
-mesh.from_pydata(DATA["points"], [], [])
-if DATA["points"]:
-    colors = mesh.attributes.new("color", "BYTE_COLOR", "POINT")
-    colors.data.foreach_set("color_srgb", DATA["colors"])
-collection.objects.link(bpy.data.objects.new("factorsfm points", mesh))
+def add_points(name, points, colors):
+    mesh = bpy.data.meshes.new(name)
+    mesh.from_pydata(points, [], [])
+    if points:
+        mesh.attributes.new("color", "BYTE_COLOR", "POINT").data.foreach_set("color_srgb", colors)
+    cloud = bpy.data.objects.new(name, mesh)
+    collection.objects.link(cloud)
+    return cloud
+
+add_points("factorsfm points", DATA["points"], DATA["colors"])
+for thing, null in zip(DATA["objects"], moving):
+    add_points(thing["name"] + " points", thing["points"], thing["colors"]).parent = null
 
 footage = DATA["footage"]
 if footage:
@@ -86,7 +106,8 @@ scene.frame_set(DATA["range"][0])
 def write_blender(shot: Shot, path: Path) -> None:
     """Write a script for Blender 3.4 or newer, which is run in Blender or with ``blender --python camera.py``.
 
-    It adds a collection to the open scene and sets the scene's size, pixel aspect, frame rate and range. Unregistered
+    It adds a collection to the open scene and sets the scene's size, pixel aspect, frame rate and range. An object is
+    an empty with keys, the parent of its points. Unregistered
     frames have no key (Blender interpolates); the camera's custom property ``not_registered`` lists them. Blender's
     camera has no distortion, so the footage behind it should be undistorted.
 
@@ -116,17 +137,33 @@ def _data(shot: Shot) -> dict[str, Any]:
         "frames": shot.numbers,
         "lost": shot.lost,
         "locations": shot.world_from_film[:, :3, 3].tolist(),
-        "rotations": _quaternions(shot),
+        "rotations": _quaternions(shot.world_from_film),
         "points": shot.reconstruction.points.tolist(),
-        "colors": np.pad(shot.reconstruction.colors / 255, ((0, 0), (0, 1)), constant_values=1).ravel().tolist(),
+        "colors": _colors(shot.reconstruction.colors),
+        "objects": [
+            {
+                "name": thing.name,
+                "frames": thing.numbers,
+                "locations": thing.world_from_object[:, :3, 3].tolist(),
+                "rotations": _quaternions(thing.world_from_object),
+                "points": thing.points.tolist(),
+                "colors": _colors(thing.colors),
+            }
+            for thing in shot.objects
+        ],
         "footage": _footage(shot),
     }
 
 
-def _quaternions(shot: Shot) -> list[list[float]]:
+def _colors(rgb: NDArray[np.uint8]) -> list[float]:
+    """Red, green, blue and alpha of all points in a row, from 0 to 1."""
+    return list(np.pad(rgb / 255, ((0, 0), (0, 1)), constant_values=1).ravel().tolist())
+
+
+def _quaternions(matrices: NDArray[np.float64]) -> list[list[float]]:
     """Quaternions w, x, y, z, with signs that keep neighbours close, since Blender interpolates each number."""
     found: list[list[float]] = []
-    for matrix in shot.world_from_film:
+    for matrix in matrices:
         x, y, z, w = pycolmap.Rotation3d(matrix[:3, :3]).quat
         quaternion = np.array([w, x, y, z])
         if found and np.dot(found[-1], quaternion) < 0:

@@ -48,12 +48,15 @@ def write_nuke(shot: Shot, folder: Path) -> None:
     The script undistorts the footage with one STMap and renders the points over the undistorted plate. Beside that, it
     distorts the render with the other STMap and lays it over the original footage. A lens without distortion has no
     STMaps. The principal point is in the camera's window translation, the ratio of the focal lengths in its window
-    scale (the format's pixels are square). Unregistered frames have no key; a note lists them.
+    scale (the format's pixels are square). An object is an axis that moves its points. Unregistered frames have no
+    key; a note lists them.
 
     Raises:
         InputError: the package that writes the STMaps is missing.
     """
     (folder / POINTS).write_text(_tetrahedra(shot.reconstruction.points, shot.point_size), encoding="ascii")
+    for thing in shot.objects:
+        (folder / f"{thing.name}.obj").write_text(_tetrahedra(thing.points, shot.point_size), encoding="ascii")
     if shot.distorts:
         write_stmaps(shot, folder)
     (folder / SCRIPT).write_text(_script(shot), encoding="utf-8")
@@ -75,6 +78,7 @@ def _script(shot: Shot) -> str:
         "set camera [stack 0]",
         _node("ReadGeo2", inputs=0, file=f'"{_BESIDE_SCRIPT}{POINTS}"', name="Points"),
         "set points [stack 0]",
+        *_objects(shot),
         *("push $camera", "push $points", "push $plain_plate"),
         _node("ScanlineRender", inputs=3, name="PointsOnUndistortedPlate"),
     ]
@@ -144,6 +148,33 @@ def _camera(shot: Shot) -> str:
         win_scale=_pair(1, 1 / lens.pixel_aspect),
         name="Camera",
     )
+
+
+def _objects(shot: Shot) -> list[str]:
+    """An axis for each object, its points moved by it, and a scene of all points in the place of those of the scene."""
+    parts = []
+    for thing in shot.objects:
+        parts += [
+            _node(
+                "Axis2",
+                inputs=0,
+                rot_order="ZXY",
+                translate=_curves(thing.numbers, thing.world_from_object[:, :3, 3]),
+                rotate=_curves(thing.numbers, angles_zxy(thing.world_from_object[:, :3, :3])),
+                name=thing.name,
+            ),
+            _node("ReadGeo2", inputs=0, file=f'"{_BESIDE_SCRIPT}{thing.name}.obj"', name=f"{thing.name}_points"),
+            _node("TransformGeo", inputs=2, name=f"{thing.name}_moved"),
+            f"set {thing.name} [stack 0]",
+        ]
+    if parts:
+        parts += [
+            *(f"push ${thing.name}" for thing in shot.objects),
+            "push $points",
+            _node("Scene", inputs=len(shot.objects) + 1, name="AllPoints"),
+            "set points [stack 0]",
+        ]
+    return parts
 
 
 def _window_translation(lens: Lens) -> tuple[float, float]:

@@ -16,6 +16,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from factorsfm.export.moving import MovingNull, moving_nulls, object_in_world
 from factorsfm.export.options import ExportOptions, UpAxis
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.support.errors import InputError
@@ -147,6 +148,11 @@ class Shot:
         return np.asarray(self.world_from_opencv @ _FILM_CAMERA, dtype=np.float64)
 
     @cached_property
+    def objects(self) -> list[MovingNull]:
+        """What moves by itself."""
+        return moving_nulls(self.reconstruction.objects, self.first_frame)
+
+    @cached_property
     def lens(self) -> Lens:
         """The lens of the shot."""
         return self._pinhole(self.reconstruction.camera)
@@ -179,13 +185,6 @@ class Shot:
         return camera.model_name not in _PINHOLE_IF_ZERO or bool(np.any(camera.params[camera.extra_params_idxs()]))
 
     @property
-    def linear_colors(self) -> NDArray[np.float32]:
-        """(n, 3) colours of the points from 0 to 1, in linear light."""
-        srgb = self.reconstruction.colors / 255
-        linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-        return np.asarray(linear, dtype=np.float32)
-
-    @property
     def clipping(self) -> tuple[float, float]:
         """Near and far clipping distance, around the whole scene and within the range of a 24-bit depth buffer."""
         return 5 * self.point_size, 1e5 * self.point_size
@@ -198,6 +197,13 @@ class Shot:
             return 0.01 * self.scale
         centers = self.world_from_opencv[:, :3, 3].mean(axis=0)
         return float(np.median(np.linalg.norm(points - centers, axis=1))) / 500
+
+
+def linear_colors(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """(n, 3) colours from 0 to 1 in linear light."""
+    srgb = rgb / 255
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    return np.asarray(linear, dtype=np.float32)
 
 
 def make_shot(reconstruction: Reconstruction, options: ExportOptions, defaults: Defaults) -> Shot:
@@ -233,7 +239,8 @@ def _in_world(reconstruction: Reconstruction, world: NDArray[np.float64], scale:
     translations = [frame.cam_from_world.translation for frame in frames if frame.cam_from_world is not None]
     if not (np.isfinite(points).all() and np.isfinite(translations).all()):
         raise InputError(f"the scene is not finite at scale {scale:g}")
-    return replace(reconstruction, frames=frames, points=points)
+    objects = tuple(object_in_world(thing, world, scale) for thing in reconstruction.objects)
+    return replace(reconstruction, frames=frames, points=points, objects=objects)
 
 
 def _source_fps(frames: list[FrameResult]) -> float | None:

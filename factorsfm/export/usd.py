@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factorsfm.export.options import UpAxis
-from factorsfm.export.shot import Shot
+from factorsfm.export.shot import Shot, linear_colors
 from factorsfm.export.vfx import failures_as_os_errors, require
 from factorsfm.support.errors import InputError
 
@@ -20,7 +22,8 @@ def write_usd(shot: Shot, path: Path) -> None:
     By default the stage is in centimetres and one world unit is a metre. Apertures and focal length are in tenths of
     the stage's unit, as USD requires: millimetres in a stage in centimetres. The principal point is in the aperture
     offsets. There is one sample per registered frame; USD interpolates between them, and the stage's custom data
-    ``notRegistered`` lists the other frames. Distortion is not included.
+    ``notRegistered`` lists the other frames. An object is a transform with a sample for each of its frames, and its
+    points are below it. Distortion is not included.
 
     Raises:
         InputError: usd-core is missing, the suffix is not one of USD, or the up axis is not one of USD.
@@ -59,12 +62,21 @@ def write_usd(shot: Shot, path: Path) -> None:
     for number, matrix in zip(shot.numbers, shot.world_from_film, strict=True):
         transform.Set(gf.Matrix4d(matrix.T.tolist()), number)
 
-    points = geom.Points.Define(stage, POINTS)
-    points.CreatePointsAttr(vt.Vec3fArray.FromNumpy(shot.reconstruction.points.astype(np.float32)))
-    points.CreateWidthsAttr(vt.FloatArray([shot.point_size]))
-    points.SetWidthsInterpolation(geom.Tokens.constant)
-    colors = points.CreateDisplayColorPrimvar(geom.Tokens.vertex)
-    colors.Set(vt.Vec3fArray.FromNumpy(shot.linear_colors))
-    points.CreateExtentAttr(geom.Points.ComputeExtent(points.GetPointsAttr().Get(), points.GetWidthsAttr().Get()))
+    _write_points(stage, POINTS, shot.reconstruction.points, shot.reconstruction.colors, shot.point_size)
+    for thing in shot.objects:
+        null = geom.Xform.Define(stage, f"/factorsfm/{thing.name}").AddTransformOp()
+        for number, matrix in zip(thing.numbers, thing.world_from_object, strict=True):
+            null.Set(gf.Matrix4d(matrix.T.tolist()), number)
+        _write_points(stage, f"/factorsfm/{thing.name}/points", thing.points, thing.colors, shot.point_size)
     with failures_as_os_errors():
         stage.Save()
+
+
+def _write_points(stage: Any, path: str, xyz: NDArray[np.float64], rgb: NDArray[np.uint8], width: float) -> None:
+    geom, vt = require("pxr.UsdGeom"), require("pxr.Vt")
+    points = geom.Points.Define(stage, path)
+    points.CreatePointsAttr(vt.Vec3fArray.FromNumpy(xyz.astype(np.float32)))
+    points.CreateWidthsAttr(vt.FloatArray([width]))
+    points.SetWidthsInterpolation(geom.Tokens.constant)
+    points.CreateDisplayColorPrimvar(geom.Tokens.vertex).Set(vt.Vec3fArray.FromNumpy(linear_colors(rgb)))
+    points.CreateExtentAttr(geom.Points.ComputeExtent(points.GetPointsAttr().Get(), points.GetWidthsAttr().Get()))

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.frames.folders import IMAGE_SUFFIXES
@@ -57,6 +58,10 @@ class FrameFolder:
             if (number := _last_number(stem)) is not None:
                 by_number.setdefault(number, []).append(file)
         self._by_number = {number: same[0] for number, same in by_number.items() if len(same) == 1}
+
+    def has(self, index: int) -> bool:
+        """Whether the folder has a file for this frame of a video."""
+        return self._find(Frame(index, np.empty((0, 0, 3), np.uint8), f"{index:06d}")) is not None
 
     def file_of(self, frame: Frame) -> Path | None:
         """The frame's file, None if it has none; counts in `asked` and `matched`."""

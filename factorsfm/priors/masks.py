@@ -65,10 +65,6 @@ class MaskFolder(FrameFolder):
         super().__init__(Path(path), (".png", ".bmp", ".tif", ".tiff"), "masks")
         self._margin = _checked_margin(margin)
 
-    def has(self, index: int) -> bool:
-        """Whether the folder has a mask for this frame of a video."""
-        return self._find(Frame(index, np.empty((0, 0, 3), np.uint8), f"{index:06d}")) is not None
-
     def __call__(self, frame: Frame) -> NDArray[np.bool_] | None:
         """The mask of a frame, None if the folder has none for it.
 
@@ -85,7 +81,7 @@ class MaskFolder(FrameFolder):
         channels = image.reshape(*image.shape[:2], -1)[..., :3]  # without alpha
         marked = (channels != 0).any(axis=2)
         is_colmap_style = image_stem(path.stem) != path.stem
-        return _fitted(~marked if is_colmap_style else marked, frame, self._margin)
+        return fitted(~marked if is_colmap_style else marked, frame, self._margin)
 
 
 class MaskModel:
@@ -131,7 +127,7 @@ class MaskModel:
             ModelError: the network fails on this frame, or gives no label map.
         """
         labels = self._label_map(self._network(frame.image))
-        return _fitted(np.isin(labels, self._labels), frame, self._margin)
+        return fitted(np.isin(labels, self._labels), frame, self._margin)
 
     def _label_map(self, output: NDArray[Any]) -> NDArray[Any]:
         if output.ndim == 4 and output.dtype.kind == "f" and output.shape[0] == 1:
@@ -181,7 +177,7 @@ def _checked_margin(margin: float) -> float:
     return margin
 
 
-def _fitted(ignore: NDArray[np.bool_], frame: Frame, margin: float) -> NDArray[np.bool_]:
+def fitted(ignore: NDArray[np.bool_], frame: Frame, margin: float) -> NDArray[np.bool_]:
     """The mask in the size of the frame, grown by the margin (a share of the image width)."""
     height, width = frame.image.shape[:2]
     mask = ignore.astype(np.uint8)

@@ -26,7 +26,7 @@ def read_mask(masks: MaskPrior | None, frame: Frame) -> NDArray[np.bool_] | None
     """
     if masks is None:
         return None
-    with _reported_failure("mask", frame):
+    with reported_failure("mask", frame):
         mask = masks(frame)
     if mask is not None and mask.shape != frame.image.shape[:2]:
         raise InputError(
@@ -47,7 +47,7 @@ def read_depth(depth: DepthPrior, frame: Frame, xy: NDArray[np.float64]) -> Imag
     Raises:
         InputError: the prior fails.
     """
-    with _reported_failure("depth", frame):
+    with reported_failure("depth", frame):
         depth_map = depth(frame)
     if depth_map is None:
         return None
@@ -60,7 +60,7 @@ def read_depth(depth: DepthPrior, frame: Frame, xy: NDArray[np.float64]) -> Imag
 
 
 @contextmanager
-def _reported_failure(what: str, frame: Frame) -> Iterator[None]:
+def reported_failure(what: str, frame: Frame) -> Iterator[None]:
     """Turn any exception of a prior into a `ModelError` that names the frame; errors of this package pass."""
     try:
         yield

@@ -104,7 +104,13 @@ def _facts(reconstruction: Reconstruction) -> dict[str, Any]:
         "Scale": "metres" if reconstruction.metric else "free",
         "Focal length": f"{focals[0]:.1f} to {focals[1]:.1f} px" if focals else f"{camera.mean_focal_length():.1f} px",
         "Lens": f"{camera.model_name} {camera.width}×{camera.height}",
-    }
+    } | _object_facts(reconstruction)
+
+
+def _object_facts(reconstruction: Reconstruction) -> dict[str, Any]:
+    """A line on the things that move by themselves, where there are some."""
+    names = [f"{found.name} ({len(found.frames)} frames)" for found in reconstruction.objects]
+    return {"Objects": ", ".join(names)} if names else {}
 
 
 def _statuses(frames: Sequence[FrameResult]) -> str:

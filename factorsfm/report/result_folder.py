@@ -15,6 +15,7 @@ from factorsfm.export.ply import write_ply
 from factorsfm.export.trajectory import write_trajectory
 from factorsfm.export.writing import exchanged, rename_all
 from factorsfm.report.page import failure_html, report_html
+from factorsfm.result.objects import objects_json
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.result.summary import failure_summary, incomplete_summary, part_name, summary
 from factorsfm.support.errors import InputError
@@ -23,14 +24,16 @@ from factorsfm.support.json_text import json_text
 from factorsfm.support.program import PROGRAM
 
 # Whatever an earlier result may have left besides summary.json; picture.png is drawn by the demo.
-_ENTRIES = ("trajectory.tum", "colmap", "points.ply", "report.html", "picture.png")
+_ENTRIES = ("trajectory.tum", "colmap", "points.ply", "objects.json", "report.html", "picture.png")
 _SUMMARY = "summary.json"
 _PARTS = "part-[0-9][0-9][0-9]*"  # folders of the other parts of an image set
 _REPLACING = f".{PROGRAM}-replacing-"  # begins the name of the folder in which a result waits that replaces another
 
 
 def write_folder(reconstruction: Reconstruction, directory: str | Path) -> None:
-    """Write trajectory.tum, colmap/, points.ply, summary.json and report.html; all of them or nothing.
+    """Write trajectory.tum, colmap/, points.ply, summary.json, report.html, and objects.json where there are objects.
+
+    All of them or nothing.
 
     Other parts of an image set become folders in it, part-002 and so on. The files of an earlier result are replaced
     one by one, and other files in such a folder stay; a result that is incomplete, because the program was killed
@@ -50,6 +53,9 @@ def _write_files(reconstruction: Reconstruction, folder: Path) -> None:
     write_trajectory(reconstruction, folder / "trajectory.tum")
     write_colmap(reconstruction, folder / "colmap")
     write_ply(reconstruction, folder / "points.ply")
+    if reconstruction.objects:
+        content = json_text(objects_json(reconstruction.objects), indent=None)
+        (folder / "objects.json").write_text(content, encoding="utf-8")
     (folder / "report.html").write_text(report_html(reconstruction), encoding="utf-8")
     (folder / _SUMMARY).write_text(json_text(summary(reconstruction)), encoding="utf-8")
 

@@ -107,4 +107,5 @@ def _prior_fit(polished: Polished, images: Sequence[MappedImage], row: int, unit
         scale_std=float(prior.scale_std[i]) * depth.unit * unit,
         shift_std=float(prior.shift_std[i]) * depth.unit,
         sigma=_MAD_TO_SIGMA * float(np.median(np.abs(residual))) * depth.unit,
+        smooth=float(polished.state.scale[i]) * prior.weight.smooth * depth.unit,
     )

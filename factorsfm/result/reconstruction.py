@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     import pycolmap
 from factorsfm.control.fit import ControlFit
 from factorsfm.inertial.fit import ImuFit
+from factorsfm.objects.object_result import ObjectResult
 from factorsfm.polish.observability import CameraObservability
 from factorsfm.support.status import FrameStatus, ShotKind
 
@@ -26,6 +27,8 @@ class PriorFit:
         scale, shift: in units of the prior's inverse depth (scale times the world unit).
         scale_std, shift_std: standard deviations from the polish.
         sigma: robust standard deviation of the residuals, in the prior's inverse depth.
+        smooth: standard deviation of the error that is smooth over the image, which the residuals do not have, in the
+            same unit; 0 if unknown.
     """
 
     scale: float
@@ -33,6 +36,7 @@ class PriorFit:
     scale_std: float
     shift_std: float
     sigma: float
+    smooth: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,6 +183,7 @@ class Reconstruction:
         control: how well the control is met, or factors that were added; None without either.
         imu: what an IMU has given, None without one that took part.
         doubts: why the images leave open what the camera does, in sentences; empty where they do not.
+        objects: things that move by themselves and were asked for, as far as they could be solved.
         notes: sentences for the user (translation unobservable, focal length guessed, ...).
         seconds: wall time by stage.
         options: all options as plain data.
@@ -206,6 +211,7 @@ class Reconstruction:
     control: ControlFit | None = None
     imu: ImuFit | None = None
     doubts: list[str] = field(default_factory=list)
+    objects: tuple[ObjectResult, ...] = ()
     notes: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
     options: dict[str, Any] = field(default_factory=dict)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from factorsfm.camera.files import camera_to_json
+from factorsfm.objects.object_result import ObjectResult
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.result.verdict import Grade, median_reprojection_error, verdict_of
 from factorsfm.support.program import PROGRAM, program_version
@@ -38,6 +39,7 @@ def summary(reconstruction: Reconstruction) -> dict[str, Any]:
         "metric": reconstruction.metric,
         "control": reconstruction.control and asdict(reconstruction.control),
         "imu": reconstruction.imu and asdict(reconstruction.imu),
+        "objects": [_object_json(found) for found in reconstruction.objects],
         "reprojection_error": median_reprojection_error(reconstruction),
         "observability": pooled_observability(reconstruction),
         "focal_length": reconstruction.camera.mean_focal_length(),
@@ -134,6 +136,18 @@ def with_total(seconds: Mapping[str, float]) -> dict[str, float]:
     return {**seconds, "total": seconds.get("total", sum(seconds.values()))}
 
 
+def _object_json(found: ObjectResult) -> dict[str, Any]:
+    """In brief; objects.json has all of it."""
+    return {
+        "name": found.name,
+        "frames": len(found.frames),
+        "points": len(found.points),
+        "scale_std": found.scale_std,
+        "rotation_std": found.rotation_std,
+        "reprojection_error": found.reprojection_error,
+    }
+
+
 def _frame_json(frame: FrameResult) -> dict[str, Any]:
     prior = frame.prior
     return {
@@ -154,6 +168,7 @@ def _frame_json(frame: FrameResult) -> dict[str, Any]:
             "shift": prior.shift,
             "shift_std": prior.shift_std,
             "sigma": prior.sigma,
+            "smooth": prior.smooth,
         },
         "observability": frame.observability and asdict(frame.observability),
         "focal_length": frame.camera and frame.camera.mean_focal_length(),

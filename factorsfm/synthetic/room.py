@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 
 import cv2
@@ -11,6 +12,8 @@ from numpy.typing import NDArray
 
 from factorsfm.camera.projection import PIXEL_CENTER
 from factorsfm.synthetic.scene import FIELD_OF_VIEW, Floats
+
+_FINER = 4.0  # how many times smaller the patterns of a moving box are than those of the room
 
 
 class Room:
@@ -23,9 +26,18 @@ class Room:
 
     def __init__(self, seed: int, focal_length: float) -> None:
         self._quads = _quads(np.random.default_rng(seed))
-        self._textures = [
-            _texture(np.random.default_rng([seed, i]), quad, focal_length) for i, quad in enumerate(self._quads)
-        ]
+        self._textures = _textures(seed, self._quads, focal_length)
+        self._things = len(self._quads)  # the first quad that is none of the room
+
+    def with_box(self, box: MovingBox, world_from_box: pycolmap.Rigid3d) -> Room:
+        """The same room with a box in it."""
+        room = copy(self)
+        room._quads, room._textures = self._quads + box.quads(world_from_box), self._textures + box.textures
+        return room
+
+    def box_mask(self, camera: pycolmap.Camera, pose: pycolmap.Rigid3d) -> NDArray[np.bool_]:
+        """(h, w) the pixels whose centres show a box of `with_box`; `pose` is cam_from_world."""
+        return np.asarray(_cast(self._quads, camera, pose, 1).quad >= self._things)
 
     def depth(self, camera: pycolmap.Camera, pose: pycolmap.Rigid3d) -> Floats:
         """(h, w) exact z-depth at the pixel centres, world units; `pose` is cam_from_world."""
@@ -34,6 +46,25 @@ class Room:
     def image(self, camera: pycolmap.Camera, pose: pycolmap.Rigid3d) -> NDArray[np.uint8]:
         """(h, w, 3) BGR, the mean of two by two samples per pixel; `pose` is cam_from_world."""
         return _render(self._quads, self._textures, camera, pose)
+
+
+class MovingBox:
+    """A textured box that may stand anywhere; its own axes run along its edges, its origin is its middle.
+
+    Args:
+        size: (3,) world units; seed: of its textures.
+        first: world_from_box where its textures are as fine as an image with `focal_length` (pixels) resolves.
+    """
+
+    def __init__(self, size: Floats, first: pycolmap.Rigid3d, seed: int, focal_length: float) -> None:
+        self._size = size
+        # What looks the same, four times as large and as far away: its patterns are a quarter of those of the room.
+        large = _box(_FINER * first.translation, _FINER * size, first.rotation)
+        self.textures = _textures(seed, large, focal_length)
+
+    def quads(self, world_from_box: pycolmap.Rigid3d) -> list[_Quad]:
+        """Its faces, in the order of `textures`."""
+        return _box(world_from_box.translation, self._size, world_from_box.rotation)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,18 +105,22 @@ def _quads(generator: np.random.Generator) -> list[_Quad]:
     for i, depth in enumerate(np.linspace(2.8, 6.2, 9)):  # boxes on the floor, right and left in turn
         size = generator.uniform([0.4, 0.6, 0.4], [0.8, 1.5, 0.8]) * [depth / 5, 1, depth / 5]
         middle = (-1) ** i * generator.uniform(0.15, 0.6) * depth * np.tan(FIELD_OF_VIEW / 2)
-        quads += _box(generator, np.array([np.clip(middle, -1.7, 1.7), floor - size[1] / 2, depth]), size)
+        quads += _box(np.array([np.clip(middle, -1.7, 1.7), floor - size[1] / 2, depth]), size, _turn(generator))
     for depth in np.linspace(3.2, 5.7, 4):  # boxes at the ceiling
         size = generator.uniform([0.3, 0.3, 0.3], [0.7, 0.7, 0.7])
         middle = generator.uniform(-0.8, 0.8) * depth * np.tan(FIELD_OF_VIEW / 2)
-        quads += _box(generator, np.array([np.clip(middle, -1.7, 1.7), ceiling + size[1] / 2, depth]), size)
+        quads += _box(np.array([np.clip(middle, -1.7, 1.7), ceiling + size[1] / 2, depth]), size, _turn(generator))
     return quads
 
 
-def _box(generator: np.random.Generator, center: Floats, size: Floats) -> list[_Quad]:
-    """The six faces of a box, rotated about the vertical by up to 40 degrees."""
-    turn = np.radians(generator.uniform(-40, 40))
-    x, y, z = pycolmap.Rotation3d(np.array([0, turn, 0])).matrix().T * size[:, None]
+def _turn(generator: np.random.Generator) -> pycolmap.Rotation3d:
+    """About the vertical by up to 40 degrees."""
+    return pycolmap.Rotation3d(np.array([0, np.radians(generator.uniform(-40, 40)), 0]))
+
+
+def _box(center: Floats, size: Floats, rotation: pycolmap.Rotation3d) -> list[_Quad]:
+    """The six faces of a box."""
+    x, y, z = rotation.matrix().T * size[:, None]
     corner = center - (x + y + z) / 2
     faces = [(x, y, z, 0.9), (z, y, x, 0.7), (x, z, y, 1.0)]
     return [
@@ -138,6 +173,10 @@ def _render(
         color = cv2.remap(textures[i], map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         cv2.copyTo(color, mask[window], image[window])
     return np.asarray(cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def _textures(seed: int, quads: list[_Quad], focal_length: float) -> list[NDArray[np.uint8]]:
+    return [_texture(np.random.default_rng([seed, i]), quad, focal_length) for i, quad in enumerate(quads)]
 
 
 def _texture(generator: np.random.Generator, quad: _Quad, focal_length: float) -> NDArray[np.uint8]:

@@ -206,6 +206,9 @@ def test_masks_are_those_of_the_whole_video(tmp_path: Path, film: Path) -> None:
     method = Method(masks=str(tmp_path / "masks"))
     jobs = plan_jobs({video: SHOTS}, method, tmp_path / "out", several=False)
     assert [job.method.masks for job in jobs] == [None, str(tmp_path / "masks")]
+    method = Method(objects=str(tmp_path / "masks"))
+    jobs = plan_jobs({video: SHOTS}, method, tmp_path / "out", several=False)
+    assert [job.method.objects for job in jobs] == [None, str(tmp_path / "masks")]
 
 
 @pytest.mark.parametrize(
@@ -216,6 +219,7 @@ def test_masks_are_those_of_the_whole_video(tmp_path: Path, film: Path) -> None:
         (["--masks", "absent"], ["no masks absent"]),
         (["--masks", "empty"], ["holds no masks"]),
         (["--masks", "other"], ["no mask in", "matches a frame"]),
+        (["--objects", "absent"], ["absent", "masks of objects"]),
         (["--workers", "2", "--scheduler", "127.0.0.1:1"], ["--workers", "--scheduler"]),
     ],
 )

@@ -198,6 +198,7 @@ def test_files_that_hold_something_else(content: bytes, folder: Path, capsys: py
         ["--depth", "junk"],
         ["--depth", "maps", "--depth-kind", "inverse"],
         ["--masks", "junk"],
+        ["--objects", "junk"],
         ["--unordered", "--features", "junk"],
         ["--unordered", "--work", "junk"],
         ["--unordered", "--work", "work"],

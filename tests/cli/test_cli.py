@@ -61,6 +61,7 @@ def test_reconstruct_writes_the_result(
         "depth": "tcmonodepth",
         "depth_kind": None,
         "masks": None,
+        "objects": None,
         "frames": None,
         "lens": "auto",
         "shutter": "auto",
@@ -81,11 +82,11 @@ def test_reconstruct_writes_the_result(
 def test_options_are_handed_on(tmp_path: Path, calls: list[dict[str, Any]]) -> None:
     (tmp_path / "camera.json").write_text(json.dumps(CAMERA))
     arguments = ["--camera", str(tmp_path / "camera.json"), "--depth", "none", "--depth-kind", "metric"]
-    arguments += ["--masks", "m", "--frames", "5:50:3", "--preset", "paper"]
+    arguments += ["--masks", "m", "--objects", "o", "--frames", "5:50:3", "--preset", "paper"]
     assert main(["reconstruct", "images", "--output", str(tmp_path / "out"), *arguments]) == 0
     (call,) = calls
     assert call["camera"].params.tolist() == [500, 500, 320, 240]
-    assert (call["depth"], call["depth_kind"], call["masks"]) == (None, "metric", "m")
+    assert (call["depth"], call["depth_kind"], call["masks"], call["objects"]) == (None, "metric", "m", "o")
     assert (call["frames"], call["preset"]) == (slice(5, 50, 3), "paper")
 
 

@@ -40,6 +40,16 @@ def report_cameras(scene, camera):
     return frames
 
 
+def report_object(scene, null):
+    (cloud,) = null.children
+    places = {}
+    for frame in range(scene.frame_start, scene.frame_end + 1):
+        scene.frame_set(frame)
+        places[frame] = [list(cloud.matrix_world @ vertex.co) for vertex in cloud.data.vertices]
+    keys = sorted({key.co[0] for curve in null.animation_data.action.fcurves for key in curve.keyframe_points})
+    return {"keys": keys, "places": places}
+
+
 def report_scene(script):
     bpy.ops.wm.read_factory_settings(use_empty=True)
     runpy.run_path(script)
@@ -57,6 +67,7 @@ def report_scene(script):
         "points": [list(vertex.co) for vertex in mesh.vertices],
         "colors": [list(value.color_srgb) for value in mesh.attributes["color"].data],
         "background": None,
+        "objects": {thing.name: report_object(scene, thing) for thing in bpy.data.objects if thing.type == "EMPTY"},
     }
     if camera.data.show_background_images:
         (behind,) = camera.data.background_images
