@@ -101,8 +101,8 @@ def sigmas(
     Returns:
         (n,), NaN without a pose or covariance; 0 for the first one.
     """
-    found_rotations, found_centers = _relative(*pose_arrays(poses))
-    rotations, centers = _relative(rotations, centers)
+    found_rotations, found_centers = relative_poses(*pose_arrays(poses))
+    rotations, centers = relative_poses(rotations, centers)
     settled = slice(len(centers) // 3, None)
     valid = np.isfinite(found_centers[settled, 0])
     true = centers[settled][valid]
@@ -119,7 +119,7 @@ def sigmas(
     return found
 
 
-def _relative(rotations: Array, centers: Array) -> tuple[Array, Array]:
+def relative_poses(rotations: Array, centers: Array) -> tuple[Array, Array]:
     """Rotations and centres in the frame of the first camera."""
     return np.einsum("ji,njk->nik", rotations[0], rotations), (centers - centers[0]) @ rotations[0]
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from factorsfm.adjustment.columns import Columns
 from factorsfm.adjustment.depth_term import AffinePrior, DepthTerm
-from factorsfm.adjustment.elimination import Block, Elimination, Normal, reduced
+from factorsfm.adjustment.elimination import Block, Elimination, Normal, Term, reduced
 from factorsfm.adjustment.marginals import Marginals, tangent_basis
 from factorsfm.adjustment.noise import block_inflation
 from factorsfm.adjustment.observations import Observations, PriorObservations
@@ -263,6 +263,10 @@ class BundleAdjustment:
         camera = np.zeros((self.columns.size, self.columns.size))
         camera[np.ix_(free, free)] = covariance_of(conditioned(information[np.ix_(free, free)]))
         return Marginals(camera, given_camera, blocks)
+
+    def track_residuals(self) -> Term:
+        """The residuals of the tracks, linearised at the present state."""
+        return self._tracks.linearized(self.state)
 
     def influences(self, columns: Index) -> Array:
         """(n, p) by how much the residuals of each point alone move some columns of the camera side.

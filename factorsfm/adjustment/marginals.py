@@ -80,6 +80,13 @@ def in_scene_unit(marginals: Marginals, state: State, control: Array | None = No
     Args:
         control: by how much `State.control` changes with the logarithm of the scene's size; None without control.
     """
+    measured = np.zeros((len(state.bearing), 3, 1))
+    measured[:, 2] = 1.0 / state.inverse_distance.sum()
+    return marginals.relative(unit_motion(state, control)[:, None], measured)
+
+
+def unit_motion(state: State, control: Array | None = None) -> Array:
+    """(c,) movement of the camera side by the logarithm of the mean inverse distance; `control` as `in_scene_unit`."""
     columns = Columns.of(state)
     motion = np.zeros(columns.size)
     motion[columns.poses].reshape(-1, 6)[:, 3:] = state.translation
@@ -87,9 +94,7 @@ def in_scene_unit(marginals: Marginals, state: State, control: Array | None = No
     motion[columns.field] = state.field
     if control is not None:
         motion[columns.control] = control
-    measured = np.zeros((len(state.bearing), 3, 1))
-    measured[:, 2] = 1.0 / state.inverse_distance.sum()
-    return marginals.relative(motion[:, None], measured)
+    return motion
 
 
 def pose_covariances(camera: Array, derivative: Array, columns: Index, state: State) -> tuple[Array, Array]:

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.columns import Columns
-from factorsfm.adjustment.marginals import Marginals, in_scene_unit, pose_covariances
+from factorsfm.adjustment.marginals import pose_covariances
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import Free, Known
+from factorsfm.adjustment.shared_errors import in_scene_unit_with, shared_errors
 from factorsfm.adjustment.state import State
 from factorsfm.control.fit import ControlFit, ControlResidual
 from factorsfm.control.known import LocatedControl
@@ -45,15 +46,16 @@ class Controlled:
         world_alignment: from that to the world of the control; None where this has no unit of its own.
         covariance: (k, 6, 6) of the poses in the control's world, in the polish's unit of length;
             relative_covariance: of each pose relative to the one before.
-        camera_covariance: (c, c) of the camera side relative to the scene's unit.
+        camera_covariance: (c, c) of the camera side relative to the scene's unit; point_std: (n,) of the inverse
+            distances.
     """
 
     adjustment: BundleAdjustment
     world_alignment: Similarity | None
     covariance: Array
     relative_covariance: Array
-    marginals: Marginals
     camera_covariance: Array
+    point_std: Array
     fit: ControlFit
 
 
@@ -147,13 +149,14 @@ def described(solved: BundleAdjustment, term: AlignedTerm, fit: Callable[[float,
     """
     state, marginals = solved.state, solved.marginals()
     aligned = term.aligned(state)
-    relative = in_scene_unit(marginals, state, _by_size(aligned))
-    covariance, relative_covariance = _pose_covariances(marginals, aligned)
+    shared = shared_errors(solved, marginals)
+    relative, point_std = in_scene_unit_with(shared, marginals, state, _by_size(aligned))
+    covariance, relative_covariance = _pose_covariances(marginals.camera + shared.in_world(solved.held), aligned)
     log_scale = Columns.of(state).control.start + 6
     spread = aligned.scale * np.sqrt(np.trace(covariance[:, 3:, 3:], axis1=1, axis2=2))
     scale_std = float(np.sqrt(max(float(relative[log_scale, log_scale]), 0.0)))
     return Controlled(
-        solved, aligned.similarity, covariance, relative_covariance, marginals, relative,
+        solved, aligned.similarity, covariance, relative_covariance, relative, point_std,
         fit(scale_std, float(np.median(spread))),
     )  # fmt: skip
 
@@ -167,14 +170,15 @@ def _residual(item: Item, residual: Array) -> ControlResidual:
     return ControlResidual.of(item.name, item.unit, item.sigma, sigmas)
 
 
-def _pose_covariances(marginals: Marginals, aligned: AlignedState) -> tuple[Array, Array]:
-    """As `pose_covariances`, of the poses in the control's world, in the polish's unit of length.
+def _pose_covariances(camera: Array, aligned: AlignedState) -> tuple[Array, Array]:
+    """As `pose_covariances`, from that of the camera side (c, c), of the poses in the control's world, in the polish's
+    unit of length.
 
     A change of the world alignment turns and moves all cameras: ``R (s x) + T`` by its variables, seen from the camera.
     """
     used, derivatives = zip(*(aligned.known_pose(row) for row in range(len(aligned.state.rotation))), strict=True)
     in_polish = np.repeat([1.0, 1.0 / aligned.scale], 3)[:, None]
-    return pose_covariances(marginals.camera, in_polish * np.array(derivatives), np.array(used), aligned.state)
+    return pose_covariances(camera, in_polish * np.array(derivatives), np.array(used), aligned.state)
 
 
 def _by_size(aligned: AlignedState) -> Array:

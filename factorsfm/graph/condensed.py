@@ -30,9 +30,9 @@ def condensed_factor(
 
     The graph of `factor_graph` without the prior on the first pose is linearised at the result, and all but poses is
     eliminated. The factor is on the poses ``X(i)`` alone and has their joint distribution: with the first pose held and
-    the unit of length fixed, their standard deviations are those of `FrameResult.covariance`, or up to a tenth smaller
-    where a prior decides. Position and orientation of the whole are open, its unit all but open: weak priors on points
-    and poses and on the scales of the depth prior remain.
+    the unit of length fixed, their standard deviations are those of `FrameResult.covariance` less what neighbouring
+    tracks share, or up to a tenth smaller where a prior decides. Position and orientation of the whole are open, its
+    unit all but open: weak priors on points and poses and on the scales of the depth prior remain.
 
     Being linear, the factor holds near the result. A shot that belongs elsewhere in the world of the larger graph, or
     has another size, is moved there before it is condensed.

@@ -23,9 +23,8 @@ class CameraObservability:
     would leave twice the error. The shares are about the camera's position relative to the scene as a whole: in the
     coordinates (position, orientation, unit of length) in which the points are where they should be in the
     least-squares sense (distant and badly determined ones count less). The pixel slide is relative to the first
-    registered camera, like `FrameResult.covariance`. Both speak of the random errors of tracks and prior, not of
-    tracks that are wrong together: on rendered shots of three seconds the true drift, 0.01 to 0.25 pixels, was 2 to 17
-    times the pixel slide.
+    registered camera, like `FrameResult.covariance`. The shares speak of the errors of tracks one by one;
+    the slide has the errors that neighbours share, see `shared_errors`.
 
     Attributes:
         prior_share: what the depth prior adds to the information on the position, ``1 - trace(C) / trace(C0)`` with

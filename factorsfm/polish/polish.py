@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.columns import Columns
-from factorsfm.adjustment.marginals import in_scene_unit, pose_covariances
+from factorsfm.adjustment.marginals import pose_covariances
 from factorsfm.adjustment.noise import coordinate_sigma
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.prior_term import PriorPart, joint_problem
 from factorsfm.adjustment.problem import ErrorModel, Free
 from factorsfm.adjustment.residuals import cauchy
+from factorsfm.adjustment.shared_errors import in_scene_unit_with, shared_errors
 from factorsfm.adjustment.state import State
 from factorsfm.adjustment.track_errors import TrackErrors, measure_track_errors
 from factorsfm.control.known import LocatedControl
@@ -163,11 +164,12 @@ def _solved(
     adjustment, prior = _problem(shot, start, frames, options)
     adjustment.solve(options.final_iterations)
     marginals = adjustment.marginals()
-    covariance = in_scene_unit(marginals, adjustment.state)
+    shared = shared_errors(adjustment, marginals)
+    covariance, point_std = in_scene_unit_with(shared, marginals, adjustment.state)
     result = Polished(
         frames, adjustment.state, start.tracks, start.observations, adjustment.reprojection_errors(), start.sigma,
         *adjustment.observation_sigmas(), start.core.motion, *_pose_covariances(covariance, adjustment.state),
-        camera_observability(adjustment, marginals, covariance), marginals.inverse_distance_std(covariance),
+        camera_observability(adjustment, marginals, covariance), point_std,
         left_out, prior, start.core.lens, start.core.shutter, moving=start.core.moving, turns=start.core.turns,
         rest=start.core.rest, contradiction=start.depths.correlation,
     )  # fmt: skip
@@ -235,7 +237,7 @@ def _take_over(result: Polished, found: Controlled) -> None:
     result.state, result.errors = found.adjustment.state, found.adjustment.reprojection_errors()
     result.covariance, result.relative_covariance = found.covariance, found.relative_covariance
     result.world_alignment, result.control = found.world_alignment, found.fit
-    result.point_std = found.marginals.inverse_distance_std(found.camera_covariance)
+    result.point_std = found.point_std
     result.describe_prior(found.adjustment, found.camera_covariance)
 
 

@@ -1,16 +1,36 @@
 """Results of rendered shots, and covariances of the poses of their graphs."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
+from unittest.mock import patch
 
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import L, X
 
 from factorsfm import Options, Reconstruction, Stream
+from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
+from factorsfm.adjustment.marginals import Marginals
+from factorsfm.adjustment.shared_errors import SharedErrors
+from factorsfm.polish import polish
 from factorsfm.support.options import ShutterUse
 from factorsfm.synthetic import Motion, render_shot
 from tests.rendered import Maps, rendered, simulated_maps, with_fewer_tracks
+
+
+@contextmanager
+def tracks_one_by_one() -> Iterator[None]:
+    """Covariances of the polish without what neighbouring tracks share, which no factor on one track can hold."""
+    with patch.object(polish, "shared_errors", nothing_shared):
+        yield
+
+
+def nothing_shared(adjustment: BundleAdjustment, marginals: Marginals) -> SharedErrors:
+    state = adjustment.state
+    camera, points = np.zeros((adjustment.columns.size, 1)), np.zeros((len(state.bearing), 1))
+    return SharedErrors(camera, points, np.zeros((len(state.rotation), 6, 6)))
 
 
 @cache
@@ -20,7 +40,8 @@ def result(motion: Motion, guided: bool = True, shutter: ShutterUse = "global") 
     stream = Stream(shot.camera, depth=prior, options=replace(with_fewer_tracks(Options()), shutter=shutter))
     for image in shot.images:
         stream.push(image)
-    return stream.finish()
+    with tracks_one_by_one():
+        return stream.finish()
 
 
 @cache
@@ -30,7 +51,8 @@ def longer_result() -> Reconstruction:
     stream = Stream(shot.camera, options=replace(with_fewer_tracks(Options(), 120), shutter="global"))
     for image in shot.images:
         stream.push(image)
-    return stream.finish()
+    with tracks_one_by_one():
+        return stream.finish()
 
 
 def pose_covariance(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, r: Reconstruction) -> np.ndarray:
