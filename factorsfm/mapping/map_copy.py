@@ -30,6 +30,7 @@ class MapUpdate:
         poses, affines, covariances: of the keyframes that moved, by position.
         focal: a better focal length (pixels), None where it stays as it is.
         burn_ins: tracks of what is laid over the images.
+        moving: how many tracks move by themselves, so that a young map begins again without them.
         mirrored: see `UpdateResult`.
         unit: how many times as long lengths are now, all others of the map included.
         added: the caller's factors as the next update needs them; offered: how many of those that waited were tried;
@@ -49,6 +50,7 @@ class MapUpdate:
     covariances: dict[int, Array] = field(default_factory=dict)
     focal: float | None = None
     burn_ins: Index = field(default_factory=lambda: np.zeros(0, np.int64))
+    moving: int = 0
     mirrored: bool = False
     no_prior: bool = False
     unit: float = 1.0
@@ -56,6 +58,11 @@ class MapUpdate:
     offered: int = 0
     refused: str = ""
     misfit: str = ""
+
+    @property
+    def note(self) -> str:
+        """What became of the map, where that is out of the ordinary."""
+        return f"{self.moving} tracks move by themselves, the map begins again without them" if self.moving else ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,11 +11,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
-from factorsfm.adjustment.gather import gather
-from factorsfm.adjustment.observations import Observations
-from factorsfm.adjustment.problem import ErrorModel, Free
-from factorsfm.adjustment.state import State
 from factorsfm.graph.added_factors import AddedFactors, on_window
 from factorsfm.graph.keyframe_graph import KeyframeGraph, UpdateResult
 from factorsfm.graph.live_isam import YOUNG
@@ -29,18 +24,14 @@ from factorsfm.mapping.map_copy import MapCopy, MapUpdate
 from factorsfm.mapping.map_registration import fits_pose
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.mapping.prior_check import inconsistency
-from factorsfm.mapping.registration import register_image
-from factorsfm.mapping.starts import lift
-from factorsfm.motion.burn_ins import contradicts, resting
+from factorsfm.mapping.young_map import YOUNG_KEYFRAMES, burn_ins_of, lifted_anew, resting_among, scene_alone
 from factorsfm.support.options import PolishOptions
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 _GROSS = 4.0  # times the threshold of an inlier: a young map is wrong, too, and long tracks are precious
-YOUNG_KEYFRAMES = 6  # up to which a map is easily bent: by burn-ins, then it begins again, or by what is no prior
 _YOUNG_ITERATIONS = 8  # divided by the number of keyframes
-_TRIAL_ITERATIONS = 5  # that tell whether what rests is at odds with the others
 _SOLVER = replace(PolishOptions(), tolerance=1e-3)
 _COVARIANCE_INFLATION = 20.0  # the errors of neighbouring tracks are correlated: so many tracks count as one
 _LENS_KEYFRAMES = 6  # from which an unknown focal length is estimated
@@ -93,15 +84,17 @@ def _extended(copy: MapCopy, graph: KeyframeGraph) -> MapUpdate:
         return MapUpdate(position, depth, False, f"{seen} of {o.min_inliers} needed landmarks in the keyframe")
     # A young map has the shape that the prior guessed, and far to go; it is also cheap.
     iterations = max(o.graph_iterations, _YOUNG_ITERATIONS // len(copy.keyframes))
-    fits = fits_pose(newest, ids, copy.points, copy.focal, o)
-    contradicting, laid_over = ids[~fits], _resting_among(images, ids, ~fits, copy.focal)
+    fits, mapped = fits_pose(newest, ids, copy.points, copy.focal, o), ids
+    contradicting, laid_over = ids[~fits], resting_among(images, ids, ~fits, copy.focal)
     ids, others = choose_landmarks(images, ids[fits], copy.added.tracks)
     others = np.union1d(others, np.setdiff1d(contradicting, laid_over))
     result = _solved(copy, graph, images, constant, ids, iterations)
-    burn_ins = removed = _burn_ins(copy, images, constant, result.window)
-    if len(burn_ins):
-        kept = _lifted_anew(copy, images, np.setdiff1d(ids, burn_ins))
-        removed, ids = np.setdiff1d(ids, kept), kept
+    burn_ins, removed, moving = burn_ins_of(copy, images, constant, result.window), ids[:0], 0
+    scene = np.setdiff1d(ids, burn_ins) if len(burn_ins) else scene_alone(copy, images, result.window, mapped)
+    if not np.array_equal(scene, ids):
+        moving = 0 if len(burn_ins) else len(mapped) - len(scene)
+        ids = lifted_anew(copy, images, scene)
+        removed, others = np.setdiff1d(mapped, ids), ids[:0]
         result = _solved(copy, graph, images, constant, ids, _YOUNG_ITERATIONS)
     if not result.committed:
         return MapUpdate(position, depth, False, result.reason, mirrored=result.mirrored)
@@ -109,7 +102,7 @@ def _extended(copy: MapCopy, graph: KeyframeGraph) -> MapUpdate:
     if len(others):
         update = solve_alone(copy, images, update, others, guidance, contradicting)
     removed = np.concatenate([update.removed, removed, laid_over])
-    return replace(update, removed=np.unique(removed), burn_ins=np.union1d(burn_ins, laid_over))
+    return replace(update, removed=np.unique(removed), burn_ins=np.union1d(burn_ins, laid_over), moving=moving)
 
 
 def _solved(
@@ -131,67 +124,6 @@ def _solved(
     )
     added, constants = on_window(copy.added, window, MapContents(copy.keyframes, copy.points))
     return graph.update(window, iterations, added, constants)
-
-
-def _adjustment(window: Window) -> BundleAdjustment:
-    """The landmarks and keyframes of a window without the prior, as a problem of the batch solver."""
-    distance = np.linalg.norm(window.points, axis=1)
-    state = State(
-        window.rotation, window.translation, window.points / distance[:, None], 1.0 / distance, np.log([window.focal])
-    )
-    observations = Observations(window.frame, window.point, window.pixels)
-    held = Free(held=~window.solved)
-    return BundleAdjustment(state, observations, _SOLVER, ErrorModel(window.sigma), free=held)
-
-
-def _resting_among(images: list[MappedImage], ids: Index, suspects: NDArray[np.bool_], focal: float) -> Index:
-    """Those of the suspected tracks (a part of `ids`) that rest in the image while the others move."""
-    if not suspects.any():
-        return ids[:0]
-    return ids[suspects & resting(gather([image.tracks for image in images], ids, focal))]
-
-
-def _burn_ins(copy: MapCopy, images: list[MappedImage], constant: NDArray[np.bool_], window: Window) -> Index:
-    """Tracks that rest in the image and contradict the others, when both go on from a solution with all of them."""
-    together = _adjustment(window)
-    rests = resting(together.observations)
-    if not rests.any():
-        return np.zeros(0, np.int64)
-    others = np.nonzero(~rests)[0]
-    alone = BundleAdjustment(
-        together.state.of(others),
-        together.observations.of(others),
-        _SOLVER,
-        ErrorModel(window.sigma),
-        free=Free(held=together.held),
-    )
-    for adjustment in (together, alone):
-        adjustment.solve(_TRIAL_ITERATIONS)
-    return window.ids[rests] if contradicts(together, alone, ~rests) else np.zeros(0, np.int64)
-
-
-def _lifted_anew(copy: MapCopy, window: list[MappedImage], ids: Index) -> Index:
-    """Bring a young map back to the shape that the prior guessed, and its keyframes to their place on it.
-
-    Returns:
-        Those of its points that are left; all, as they are, where the map is not young or has not begun like that.
-    """
-    first, o = window[0].tracks, copy.options
-    if len(copy.keyframes) > YOUNG_KEYFRAMES or first.depth is None:
-        return ids
-    points, valid = lift(first.xy, first.depth)
-    good = valid & np.isin(first.ids, ids)
-    seen = [np.isin(first.ids, image.tracks.ids) & good for image in window[1:]]
-    if min(map(np.count_nonzero, seen)) < o.min_inliers:
-        return ids
-    for image, mine in zip(window[1:], seen, strict=True):
-        xy = image.tracks.xy[np.isin(image.tracks.ids, first.ids[mine])]
-        found = register_image(
-            points[mine], xy, *image.pose, focal=copy.focal, sigma=o.pixel_sigma, inlier_px=o.inlier_px
-        )
-        image.rotation, image.translation = found.rotation, found.translation
-    copy.points.set(first.ids[good], points[good])
-    return first.ids[good]
 
 
 def judged(copy: MapCopy, images: list[MappedImage], result: UpdateResult) -> MapUpdate:

@@ -24,13 +24,13 @@ from factorsfm.mapping.live_covariance import live_covariance
 from factorsfm.mapping.map_contents import MapContents
 from factorsfm.mapping.map_copy import MapCopy, MapUpdate
 from factorsfm.mapping.map_registration import register_by_corners
-from factorsfm.mapping.map_update import YOUNG_KEYFRAMES
 from factorsfm.mapping.mapped_images import MappedImage, nearest_registered
 from factorsfm.mapping.point_map import PointMap
 from factorsfm.mapping.prior_trust import PriorTrust
 from factorsfm.mapping.registration import Registration
 from factorsfm.mapping.starter import NOT_JOINED, Starter, passed_by
 from factorsfm.mapping.starts import NoStart, Start
+from factorsfm.mapping.young_map import YOUNG_KEYFRAMES
 from factorsfm.priors.image_depth import ImageDepth
 from factorsfm.support.options import Options
 from factorsfm.support.parallax import parallax
@@ -364,7 +364,7 @@ class Mapper(IncrementalMapper):
             image.keyframe = False
             return
         self.keyframes.append(update.position)
-        self.note = self.additions.follow(update) or self.note
+        self.note = self.additions.follow(update) or update.note or self.note
         if update.unit != 1.0:
             self._rescale(update.unit)
         before = image.pose

@@ -16,6 +16,7 @@ from factorsfm.adjustment.residuals import cauchy
 
 _SIGMAS = 10.0  # of an observation: a typical error beyond is not one of tracking
 _SPREADS = 3.0  # robust standard deviations of the logarithms of the points' errors, beyond which one stands out
+_LEAST_SPREAD = 0.2  # of these logarithms, however alike the points are
 _LEAST, _LEAST_SHARE = 8, 0.02  # points: fewer do no harm
 # Of the cost of the others' observations, if they are explained alone. Where nothing moves, it is 0.998 and more of it;
 # beside people 0.93 to 0.97.
@@ -24,25 +25,44 @@ SPOILT = 0.98
 
 def standing_out(adjustment: BundleAdjustment) -> NDArray[np.bool_]:
     """(n,) which points a solution does not explain at all; none where they are too few to do harm."""
-    typical = np.sqrt(adjustment.observations.mean_by_point(adjustment.reprojection_errors() ** 2))
-    size = np.log(typical + 1e-6)
+    size = _log_errors(adjustment)
     center = np.median(size)
     spread = 1.4826 * np.median(np.abs(size - center))
-    found = (typical > _SIGMAS * adjustment.sigma) & (size > center + _SPREADS * spread)
+    found = (size > np.log(_SIGMAS * adjustment.sigma)) & (size > center + _SPREADS * spread)
     return np.asarray(found & (found.sum() >= max(_LEAST, _LEAST_SHARE * len(found))))
 
 
-def bounded_cost(adjustment: BundleAdjustment, sigma: float, observations: int) -> float:
-    """Robust cost in which no observation, and none that the solution leaves out, costs more than one that stands out.
+def as_exact(adjustment: BundleAdjustment, members: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(n,) which points are as exact as some of them are, and these.
 
-    Solutions that explain different points are compared by it: what moves by itself costs the right one no more than
+    Args:
+        adjustment: of all points, with cameras from the members alone; members: (n,).
+    """
+    size = _log_errors(adjustment)
+    center = np.median(size[members])
+    spread = max(1.4826 * float(np.median(np.abs(size[members] - center))), _LEAST_SPREAD)
+    return np.asarray(members | (size < center + _SPREADS * spread))
+
+
+def _log_errors(adjustment: BundleAdjustment) -> NDArray[np.float64]:
+    """(n,) logarithms of the typical reprojection errors of the points (pixels)."""
+    typical = np.sqrt(adjustment.observations.mean_by_point(adjustment.reprojection_errors() ** 2))
+    return np.asarray(np.log(typical + 1e-6))
+
+
+def bounded_costs(adjustment: BundleAdjustment, sigma: float) -> NDArray[np.float64]:
+    """(m,) robust costs of the observations, none larger than that of one that stands out.
+
+    Solutions that explain different points are compared by them: what moves by itself costs the right one no more than
     what it leaves out.
 
     Args:
-        sigma: of a coordinate (pixels), the same for all that are compared; observations: how many there are with
-            those of the points left out.
+        sigma: of a coordinate (pixels), the same for all that are compared.
     """
-    kernel = adjustment.options.kernel
-    most = float(cauchy(np.array([[_SIGMAS, 0.0]]), kernel)[0][0])
-    costs = np.minimum(cauchy(adjustment.reprojection_vectors() / sigma, kernel)[0], most)
-    return float(costs.sum()) + most * (observations - len(costs))
+    costs = cauchy(adjustment.reprojection_vectors() / sigma, adjustment.options.kernel)[0]
+    return np.asarray(np.minimum(costs, largest_cost(adjustment.options.kernel)))
+
+
+def largest_cost(kernel: float) -> float:
+    """Of an observation that stands out, and of one that a solution leaves out."""
+    return float(cauchy(np.array([[_SIGMAS, 0.0]]), kernel)[0][0])

@@ -21,8 +21,8 @@ from factorsfm.adjustment.noise import SMALLEST_SIGMA_PX, coordinate_sigma
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import ErrorModel
 from factorsfm.adjustment.state import State
-from factorsfm.motion.moving import bounded_cost
-from factorsfm.polish.camera_starts import in_front
+from factorsfm.motion.moving import bounded_costs
+from factorsfm.motion.readings import in_front
 from factorsfm.support.options import PolishOptions
 from factorsfm.support.rotations import exponential
 from factorsfm.tracks.image_tracks import ImageTracks, shared_tracks
@@ -89,10 +89,7 @@ def object_start(images: Sequence[ImageTracks], turns: Array, options: PolishOpt
     sigma = max(SMALLEST_SIGMA_PX, min(coordinate_sigma(solved.reprojection_errors()) for solved in found))
     # Errors of neighbouring tracks repeat themselves, and count as many times less.
     inflation = min(solved.error_inflation() for solved in found)
-    costs = [
-        bounded_cost(solved, sigma, len(observations.frame)) / inflation + _shape_cost(solved.state, width)
-        for solved in found
-    ]
+    costs = [bounded_costs(solved, sigma).sum() / inflation + _shape_cost(solved.state, width) for solved in found]
     best = found[int(np.argmin(costs))]
     others = [cost for cost, solved in zip(costs, found, strict=True) if _turns_otherwise(solved.state, best.state)]
     margin = min(others, default=np.inf) - min(costs)

@@ -9,45 +9,46 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
-from factorsfm.adjustment.noise import FIRST_SIGMA_PX, coordinate_sigma, image_cells
+from factorsfm.adjustment.noise import coordinate_sigma, image_cells
 from factorsfm.adjustment.observations import Observations
-from factorsfm.adjustment.problem import ErrorModel, Free
+from factorsfm.adjustment.problem import ErrorModel
 from factorsfm.adjustment.state import State
+from factorsfm.mapping.group_readings import from_group
 from factorsfm.motion.at_rest import Rest
 from factorsfm.motion.burn_ins import contradicts, resting
-from factorsfm.motion.moving import SPOILT, bounded_cost, standing_out
-from factorsfm.support.options import Options, PolishOptions
+from factorsfm.motion.moving import SPOILT, standing_out
+from factorsfm.motion.readings import Reading, cost, flat, most_likely, points_alone, solution_from
+from factorsfm.motion.turning import turning_groups
+from factorsfm.support.options import Options
 from factorsfm.support.rotations import exponential
 
+Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 logger = logging.getLogger(__name__)
 
 _DOUBTFUL_INFLATION = 8.0  # see `error_inflation`; right solutions have 1 to 6, wrong ones 13 to 80
 _CLEARLY = 0.9  # of the cost of the solution from the incremental map, below which another one is preferred
-_SETTLED = 0.8  # of the assumed noise, below which the measured noise asks for another round
 _ROUNDS = 3  # in which what moves is left out
-_POINT_ITERATIONS = 4  # of the points alone, until they show what fits the cameras of a start
 _CORE_TRACKS = 400  # on which the cameras are solved first
 _CELLS, _CELL_TRACKS = (8, 5), 10  # across and down, and the tracks of each with which an unknown lens is estimated
 
 
 @dataclass(frozen=True, slots=True)
-class CameraSolution:
+class CameraSolution(Reading):
     """All cameras on the core tracks.
 
     Attributes:
-        kept: which of the points it has; adjustment: converged over them; moving: how many are left out because they
-            move by themselves.
+        kept, adjustment: see `Reading`; moving: how many points are left out because they move by themselves.
         turns: whether a camera that only turns explains them, through the lens that it has found.
         rest: what rests in the image while other things move, None where nothing does.
+        rival: cost over that of the reading of the shot that comes next, if something else may be the scene; 0: none.
     """
 
-    kept: Index
-    adjustment: BundleAdjustment
     moving: int = 0
     turns: bool = False
     rest: Rest | None = None
+    rival: float = 0.0
 
 
 def best_solution(start: State, few: Observations, options: Options) -> CameraSolution:
@@ -57,36 +58,53 @@ def best_solution(start: State, few: Observations, options: Options) -> CameraSo
     incremental map may have been bent or depth-reversed beyond repair. Other starts are tried then. (The error of a
     single track may well persist for many frames: it slides along an edge.)
     """
-    kept, best = np.arange(len(start.bearing)), solution_from(start, few, options)
+    kept, best = np.arange(len(start.bearing)), solution_from(start, few, options.polish)
     static = resting(few)
     if static.any():
         others = np.nonzero(~static)[0]
-        alone = solution_from(start.of(others), few.of(others), options)
+        alone = solution_from(start.of(others), few.of(others), options.polish)
         if contradicts(best, alone, ~static):
             logger.info("%d of %d points do not move in the image and are left out", static.sum(), len(static))
             kept, start, few, best = others, start.of(others), alone.observations, alone
     found = _without_moving(best, options)
-    best = found.adjustment
-    if best.sigma > options.polish.doubtful_px or best.error_inflation() > _DOUBTFUL_INFLATION:
-        logger.info("the solution does not fit (%.2f px), trying other starts", best.sigma)
-        for other in (start, _flat(start, few, options.polish)):
+    if _doubtful(found, options):
+        logger.info("the solution does not fit (%.2f px), trying what turns together", found.adjustment.sigma)
+        found = _of_one_group(found, start, few, options)
+    if _doubtful(found, options):
+        logger.info("the solution does not fit (%.2f px), trying other starts", found.adjustment.sigma)
+        for other in (start, flat(start, few, options.polish)):
             found = _better(found, on_what_fits(other, few, options), few)
         best = found.adjustment
-        mirrored = solution_from(reversed_scene(best.state), best.observations, options)
+        mirrored = solution_from(reversed_scene(best.state), best.observations, options.polish)
         found = _better(found, replace(found, adjustment=mirrored), few)
     return replace(found, kept=kept[found.kept])
 
 
+def _doubtful(found: CameraSolution, options: Options) -> bool:
+    solved = found.adjustment
+    return solved.sigma > options.polish.doubtful_px or solved.error_inflation() > _DOUBTFUL_INFLATION
+
+
+def _of_one_group(known: CameraSolution, start: State, few: Observations, options: Options) -> CameraSolution:
+    """The solution from one of the groups that turn together, where it refutes the known one and explains more."""
+    groups = turning_groups(few, start.normalized(few), float(np.median(start.focal)))
+    readings = [from_group(group, start, few, options.polish) for group in groups]
+    solutions = [known]
+    for reading in readings:
+        found = _without_moving(reading.adjustment, options)
+        moving = found.moving + len(start.bearing) - len(reading.kept)
+        solutions.append(replace(found, kept=reading.kept[found.kept], moving=moving))
+    best, rival = most_likely(solutions, few)
+    return replace(solutions[best], rival=rival) if best else known
+
+
 def on_what_fits(start: State, few: Observations, options: Options) -> CameraSolution:
     """Converged from a start on the points that its cameras explain: what does not fit might lead away from it."""
-    points = BundleAdjustment(
-        start, few, replace(options.polish, iterations=_POINT_ITERATIONS), ErrorModel(1.0), free=Free(cameras=False)
-    )
-    points.solve()
+    points = points_alone(start, few, 1.0, options.polish)
     sigma = coordinate_sigma(points.reprojection_errors())
     moves = standing_out(BundleAdjustment(points.state, few, options.polish, ErrorModel(sigma)))
     others = np.nonzero(~moves)[0]
-    found = _without_moving(solution_from(start.of(others), few.of(others), options), options)
+    found = _without_moving(solution_from(start.of(others), few.of(others), options.polish), options)
     return replace(found, kept=others[found.kept], moving=found.moving + int(moves.sum()))
 
 
@@ -99,7 +117,7 @@ def _without_moving(solved: BundleAdjustment, options: Options) -> CameraSolutio
         if not moves.any():
             break
         others = np.nonzero(~moves)[0]
-        alone = solution_from(solved.state.of(others), solved.observations.of(others), options)
+        alone = solution_from(solved.state.of(others), solved.observations.of(others), options.polish)
         if not contradicts(solved, alone, ~moves, SPOILT):
             break
         logger.info("%d of %d points move by themselves and are left out", moves.sum(), len(moves))
@@ -113,48 +131,8 @@ def _better(known: CameraSolution, other: CameraSolution, few: Observations) -> 
     With the smaller of both: to a solution that is wrong everywhere, what the right one leaves out is no worse.
     """
     sigma = min(known.adjustment.sigma, other.adjustment.sigma)
-    cost, other_cost = (bounded_cost(s.adjustment, sigma, len(few.frame)) for s in (known, other))
-    return other if other_cost < _CLEARLY * cost else known
-
-
-def solution_from(part: State, few: Observations, options: Options) -> BundleAdjustment:
-    """Converged from one start: first with a wide kernel, then with one that fits the residuals."""
-    o = options.polish
-    errors = BundleAdjustment(part, few, o, ErrorModel(1.0)).reprojection_errors()
-    sigma = max(FIRST_SIGMA_PX, coordinate_sigma(errors))
-    adjustment = BundleAdjustment(part, few, replace(o, iterations=20, tolerance=1e-3), ErrorModel(sigma))
-    adjustment.solve()
-    iterations, measured = adjustment.iterations, coordinate_sigma(adjustment.reprojection_errors())
-    while True:
-        # A wide kernel averages over outliers; the solution counts once the kernel fits the residuals.
-        sigma = min(sigma, measured)
-        adjustment = BundleAdjustment(adjustment.state, few, o, ErrorModel(sigma))
-        adjustment.solve()
-        iterations, measured = iterations + adjustment.iterations, coordinate_sigma(adjustment.reprojection_errors())
-        if measured > _SETTLED * sigma:
-            break
-    logger.debug("cameras: %d iterations, %.3f px", iterations, measured)
-    return BundleAdjustment(in_front(adjustment.state), few, o, ErrorModel(measured))
-
-
-def _flat(part: State, few: Observations, options: PolishOptions) -> State:
-    """Rotations alone, all points at one distance: a start without any shape."""
-    still = replace(
-        part,
-        translation=np.zeros_like(part.translation),
-        inverse_distance=np.full(len(part.inverse_distance), float(np.median(part.inverse_distance))),
-    )
-    rotating = BundleAdjustment(
-        still, few, replace(options, iterations=15), ErrorModel(1.0), free=Free(translation=False)
-    )
-    return rotating.solve()
-
-
-def in_front(part: State) -> State:
-    """The solution with its scene in front: negated inverse distances and translations show the same images."""
-    if float(np.median(part.inverse_distance)) >= 0.0:
-        return part
-    return replace(part, translation=-part.translation, inverse_distance=-part.inverse_distance)
+    known_cost, other_cost = (cost(solution, few, sigma) for solution in (known, other))
+    return other if other_cost < _CLEARLY * known_cost else known
 
 
 def reversed_scene(part: State) -> State:

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.prior_term import LEAST_CORRELATION, WeighedPrior, weigh_prior
 from factorsfm.adjustment.problem import ErrorModel
-from factorsfm.polish.camera_starts import Index, reversed_scene, solution_from
+from factorsfm.motion.readings import solution_from
+from factorsfm.polish.camera_starts import Index, reversed_scene
 from factorsfm.support.options import Options
 from factorsfm.tracks.image_tracks import ImageTracks
 
@@ -57,7 +58,7 @@ def near_and_far(
     correlation = prior.weight.correlation
     if correlation >= 0.0:
         return NearAndFar(solved, None, correlation)
-    other = solution_from(reversed_scene(solved.state), solved.observations, options)
+    other = solution_from(reversed_scene(solved.state), solved.observations, options.polish)
     loss = _cost(other, solved.sigma) - _cost(solved, solved.sigma)
     again = weigh_prior(other, other.observations, tracks, images, inflation)
     fits = again is not None and again.weight.correlation >= LEAST_CORRELATION

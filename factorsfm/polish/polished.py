@@ -45,6 +45,8 @@ class Polished:
         moving: share of the longest tracks that move by themselves and are left out.
         turns: whether a camera that only turns explains the tracks through a lens of its own, see `turning_reading`.
         rest: what rests in the image while other things move, None where nothing does.
+        rival: cost of this reading of the shot over that of the next best one in which something else is the scene; 0
+            where nothing else may be.
         contradiction: see `NearAndFar.correlation`.
         world_alignment: from this world to that of the control; control: its residuals. None without control.
         unused: "Control" or "Factors added", where there are some that could not take part.
@@ -73,6 +75,7 @@ class Polished:
     moving: float = 0.0
     turns: bool = False
     rest: Rest | None = None
+    rival: float = 0.0
     contradiction: float | None = None
     world_alignment: Similarity | None = None
     control: ControlFit | None = None

@@ -19,8 +19,9 @@ from factorsfm.adjustment.state import State
 from factorsfm.lens.rolling_shutter import turns_before_shutter
 from factorsfm.lens.turning import turning_camera
 from factorsfm.motion.at_rest import LEAST_SHARE, Rest, at_rest, resting_share, share_explained
+from factorsfm.motion.readings import solution_from
 from factorsfm.motion.shot_kind import classify_motion
-from factorsfm.polish.camera_starts import CameraSolution, on_what_fits, solution_from
+from factorsfm.polish.camera_starts import CameraSolution, on_what_fits
 from factorsfm.support.options import Options
 from factorsfm.support.status import ShotKind
 
@@ -71,7 +72,7 @@ def unless_at_rest(found: CameraSolution, guess: State, few: Observations, optio
         return replace(found, rest=rest)
     still = np.nonzero(rests)[0]
     part = few.of(still)
-    solved = solution_from(_standing(guess.of(still), part), part, options)
+    solved = solution_from(_standing(guess.of(still), part), part, options.polish)
     return CameraSolution(still, solved, int((~rests).sum()), rest=rest)
 
 

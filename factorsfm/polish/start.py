@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
-from factorsfm.adjustment.noise import FIRST_SIGMA_PX
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import FocalPrior, Free
 from factorsfm.adjustment.state import State
@@ -17,11 +16,12 @@ from factorsfm.lens.estimate import estimate_lens
 from factorsfm.lens.lens import LensEstimate
 from factorsfm.lens.rolling_shutter import Shutter, find_shutter
 from factorsfm.lens.zoom import find_zoom
-from factorsfm.mapping.triangulation import Triangulation, triangulate
+from factorsfm.mapping.all_points import triangulated, with_all_points
 from factorsfm.motion.at_rest import Rest
+from factorsfm.motion.readings import solution_from
 from factorsfm.motion.shot_kind import Motion, classify_motion
 from factorsfm.motion.suspects import agreeing
-from factorsfm.polish.camera_starts import best_solution, core_tracks, solution_from
+from factorsfm.polish.camera_starts import best_solution, core_tracks
 from factorsfm.polish.near_and_far import NearAndFar, near_and_far
 from factorsfm.polish.shot import Shot
 from factorsfm.polish.simple_readings import turning_reading, unless_at_rest
@@ -31,7 +31,6 @@ from factorsfm.support.status import ShotKind
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-_TRIANGULATION_VIEWS = 10
 _MANY_TRACKS = 0.3  # of the largest number of tracks in a frame
 _MOSTLY_MOVING = 0.4  # of the core: a median of all points would say nothing of the others
 
@@ -61,7 +60,7 @@ class Core:
 
     Attributes:
         points: rows of the core among all points; adjustment: converged over them.
-        moving, turns, rest: see `Polished`.
+        moving, turns, rest, rival: see `Polished`.
     """
 
     points: Index
@@ -72,6 +71,7 @@ class Core:
     moving: float
     turns: bool
     rest: Rest | None
+    rival: float
 
 
 def polish_start(
@@ -117,14 +117,14 @@ def _solved_core(shot: Shot, frames: list[int], observations: Observations, trac
         motion = _motion(adjustment, found.rest, o)
         shutter = find_shutter(adjustment, motion, options)
     if shutter is not None:
-        adjustment = solution_from(replace(adjustment.state, lens=shutter.lens.shape), few, options)
+        adjustment = solution_from(replace(adjustment.state, lens=shutter.lens.shape), few, options.polish)
     if options.estimates_lens:
         adjustment, lens = _estimate_lens(adjustment, frames, options, shot.first_focal, moves=not found.turns)
         shutter = shutter and shutter.known_with(lens)
     if motion is None or lens is not None or shutter is not None:
         motion = _motion(adjustment, found.rest, o)
     moving = found.moving / len(core)
-    return Core(core[found.kept], adjustment, motion, lens, shutter, moving, found.turns, found.rest)
+    return Core(core[found.kept], adjustment, motion, lens, shutter, moving, found.turns, found.rest, found.rival)
 
 
 def _motion(adjustment: BundleAdjustment, rest: Rest | None, options: PolishOptions) -> Motion:
@@ -154,20 +154,9 @@ def _first_guess(shot: Shot, frames: list[int], observations: Observations, trac
     )  # fmt: skip
     if not mapped.all():
         new = np.nonzero(~mapped)[0]
-        result = _triangulated(cameras, observations, new, np.ones(len(new)))
+        result = triangulated(cameras, observations, new, np.ones(len(new)))
         bearing[new], inverse[new] = result.bearing, result.inverse_distance
     return replace(cameras, bearing=bearing, inverse_distance=np.clip(inverse, 0.02, 20.0))
-
-
-def _triangulated(cameras: State, observations: Observations, points: Index, fallback: Array) -> Triangulation:
-    """Some points from a few views each, spread over their tracks; `fallback` as in `triangulate`."""
-    o = observations.of(points)
-    start = o.first
-    length = np.diff(np.append(start, len(o.point)))[o.point]
-    place = np.arange(len(o.point)) - start[o.point]
-    spaced = place * _TRIANGULATION_VIEWS // length > (place - 1) * _TRIANGULATION_VIEWS // length
-    few = spaced | (place == length - 1)
-    return triangulate(cameras, o.at(few), inlier_px=5.0, sigma=FIRST_SIGMA_PX, fallback=fallback)
 
 
 def _world(observations: Observations) -> int:
@@ -226,22 +215,6 @@ def _with_fitting_tracks(
         return state.of(kept), observations.of(kept), tracks[kept]
     observations, kept = _only(observations, errors < options.observation_sigmas * solved.sigma)
     return state.of(kept), observations, tracks[kept]
-
-
-def with_all_points(part: State, solved: State, observations: Observations, core: Index) -> State:
-    """The cameras and core points of `part`, and the other points triangulated from the cameras as `solved`.
-
-    Their places in the map are as wrong as the map was, and in another unit.
-    """
-    count = int(observations.point[-1]) + 1
-    bearing, inverse = np.empty((count, 3)), np.empty(count)
-    bearing[core], inverse[core] = part.bearing, part.inverse_distance
-    others = np.setdiff1d(np.arange(count), core)
-    if len(others):
-        typical = float(np.median(solved.inverse_distance))
-        new = _triangulated(solved, observations, others, np.full(len(others), typical))
-        bearing[others], inverse[others] = new.bearing, np.clip(new.inverse_distance, 0.02 * typical, 20.0 * typical)
-    return replace(part, bearing=bearing, inverse_distance=inverse)
 
 
 def _usual_points(observations: Observations, errors: Array, usual: Index, options: PolishOptions) -> Index:

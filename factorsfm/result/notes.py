@@ -23,6 +23,7 @@ _NOTED_SLIDE_PX = 0.5
 _MERGED_GAP = 5  # registered frames between two weak stretches that are told as one
 _SHORTEST_STRETCH = 3  # frames
 _MOST_STRETCHES = 2  # sentences of each sort
+_AS_GOOD = 0.9  # cost over that of another reading, from which that is nearly as good
 _MOST_OF_THE_IMAGE = 0.5  # resting, from which nobody doubts that the camera is fixed
 
 
@@ -53,6 +54,11 @@ def result_doubts(polished: Polished) -> list[str]:
         doubts.append(
             "The depth prior says the opposite of the geometry, but the reversed scene does not fit the images: the "
             "lens, what moves by itself, or the prior is wrong."
+        )
+    if polished.rival > _AS_GOOD:
+        doubts.append(
+            "Two things fill the image and move against each other: which of them is the scene cannot be told, and the "
+            "camera may be relative to the other one."
         )
     if polished.lens is not None and polished.lens.misfit_px:
         doubts.append(f"The tracks fit no lens: their typical error is {polished.lens.misfit_px:.2f} pixels.")

@@ -58,7 +58,8 @@ class FrameUpdate:
         starts_anew: whether the start of the map was given up with this frame, because none of those that followed
             joined it: all poses that were given before are void.
         note: one sentence on what became of the map with this frame, where that is out of the ordinary: a start that
-            was given up, a depth prior without which the stream goes on; else empty.
+            was given up or begins again without what moves by itself, a depth prior without which the stream goes on;
+            else empty.
     """
 
     index: int

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from factorsfm.frames.frame import Frame
 from factorsfm.mapping.landmarks import agreeing_tracks
-from factorsfm.mapping.map_update import YOUNG_KEYFRAMES
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.mapping.mapper import Mapper
+from factorsfm.mapping.young_map import YOUNG_KEYFRAMES
 from factorsfm.priors.masks import MaskPrior
 from factorsfm.priors.read_priors import read_mask
 from factorsfm.support.context import Closing

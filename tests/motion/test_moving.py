@@ -8,7 +8,7 @@ import pytest
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import ErrorModel
-from factorsfm.motion.moving import bounded_cost, standing_out
+from factorsfm.motion.moving import as_exact, bounded_costs, largest_cost, standing_out
 from factorsfm.polish.camera_starts import best_solution
 from factorsfm.support.options import Options, PolishOptions
 from factorsfm.tracks.flow import _moves_otherwise
@@ -105,18 +105,26 @@ def test_few_points_do_no_harm():
     np.testing.assert_array_equal(np.flatnonzero(standing_out(solved)), np.arange(scene, scene + 8))
 
 
-def test_what_is_left_out_costs_as_much_as_what_stands_out():
+def test_what_stands_out_costs_no_more_than_what_is_left_out():
     problem, scene, _ = with_walker(0.05)
-    o, every = problem.observations, len(problem.observations.frame)
-    whole = BundleAdjustment(problem.truth, o, PolishOptions(), ErrorModel(0.1))
-    rows = np.arange(scene)
-    part = BundleAdjustment(problem.truth.of(rows), o.of(rows), PolishOptions(), ErrorModel(0.1))
-    costs = [bounded_cost(b, 0.1, every) for b in (whole, part)]
+    o = problem.observations
+    costs = bounded_costs(BundleAdjustment(problem.truth, o, PolishOptions(), ErrorModel(0.1)), 0.1)
+    walks = o.point >= scene
+    assert largest_cost(PolishOptions().kernel) == pytest.approx(2.0 * np.log1p(25.0))
+    assert costs.max() == largest_cost(PolishOptions().kernel)
     # Of the walker's first frames something fits: it begins where the state has it.
-    assert costs[0] < costs[1] < 1.1 * costs[0]
-    assert costs[1] - bounded_cost(part, 0.1, len(part.observations.frame)) == pytest.approx(
-        2.0 * np.log1p(25.0) * WALKER * problem.frames
-    )
+    assert 0.85 < costs[walks].mean() / costs.max() < 1.0
+    assert costs[~walks].mean() < 1.2
+
+
+def test_what_is_as_exact_as_the_members_joins_them():
+    problem, scene, _ = with_walker(0.05)
+    solved = BundleAdjustment(problem.truth, problem.observations, PolishOptions(), ErrorModel(0.1))
+    members = np.arange(scene + WALKER) < scene // 2
+    joined = as_exact(solved, members)
+    assert joined[members].all()
+    assert joined[scene // 2 : scene].mean() > 0.95
+    assert not joined[scene:].any()
 
 
 def test_the_patches_of_the_scene_do_not_follow_a_walker():

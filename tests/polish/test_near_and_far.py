@@ -7,9 +7,10 @@ import pytest
 
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.problem import ErrorModel
-from factorsfm.polish.camera_starts import reversed_scene, solution_from
+from factorsfm.motion.readings import solution_from
+from factorsfm.polish.camera_starts import reversed_scene
 from factorsfm.polish.near_and_far import near_and_far
-from factorsfm.support.options import Options
+from factorsfm.support.options import Options, PolishOptions
 from tests.estimation_problems import make_problem, mapped_images
 
 
@@ -19,7 +20,7 @@ def sideways(parallax):
 
 def beside_the_prior(problem, start):
     images = [image.tracks for image in mapped_images(problem, problem.truth, guided=range(12), noise=0.02)]
-    solved = solution_from(start, problem.observations, Options())
+    solved = solution_from(start, problem.observations, PolishOptions())
     return near_and_far(solved, np.arange(len(problem.points)), images, solved.error_inflation(), Options())
 
 

@@ -8,10 +8,11 @@ import pytest
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import ErrorModel
-from factorsfm.polish.camera_starts import best_solution, in_front
+from factorsfm.mapping.all_points import with_all_points
+from factorsfm.motion.readings import in_front
+from factorsfm.polish.camera_starts import best_solution
 from factorsfm.polish.connected_frames import connected_frames
 from factorsfm.polish.polish import polish
-from factorsfm.polish.start import with_all_points
 from factorsfm.support.errors import ReconstructionError
 from factorsfm.support.options import Options
 from factorsfm.support.status import FrameStatus, ShotKind

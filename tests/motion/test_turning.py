@@ -1,0 +1,99 @@
+"""Two things that fill the image and move against each other: told apart by how they turn."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from factorsfm.adjustment.observations import Observations
+from factorsfm.graph.keyframe_graph import KeyframeGraph
+from factorsfm.mapping.map_copy import MapCopy
+from factorsfm.mapping.map_update import update_map
+from factorsfm.mapping.point_map import PointMap
+from factorsfm.motion.readings import solution_from
+from factorsfm.motion.turning import turning_groups
+from factorsfm.polish.camera_starts import best_solution
+from factorsfm.support.options import MapperOptions, Options, PolishOptions
+from tests.estimation_problems import angles_between, make_problem, mapped_images, perturbed
+
+SMALL_PX = 0.1
+
+
+def with_follower(count, width, frames=16):
+    """A problem whose last `count` points are of a body that follows the camera and sways, at the left of the image.
+
+    Args:
+        width: of the body, as a share of the image.
+
+    Returns:
+        The problem, and how many points are the scene's, which are right of the body.
+    """
+    problem = make_problem("handheld", frames=frames, points=240, parallax=0.02, noise_px=SMALL_PX)
+    truth, o, k = problem.truth, problem.observations, problem.frames
+    edge = (width - 0.5) * 640 / problem.focal
+    first = o.pixels[o.first, 0] / problem.focal
+    scene = np.flatnonzero(first > edge)
+    truth, o, points = truth.of(scene), o.of(scene), problem.points[scene]
+    rng, n = np.random.default_rng(0), len(scene)
+    body = np.column_stack([rng.uniform(-320 / problem.focal, edge, count), rng.uniform(-0.25, 0.25, count)])
+    body = np.column_stack([body, np.ones(count)]) * rng.uniform(0.45, 0.55, count)[:, None]
+    sway = 0.004 * np.sin(np.arange(k)[:, None] * [1.3, 0.7, 0.4])
+    seen = body[:, None] + sway
+    xy = problem.focal * seen[..., :2] / seen[..., 2:] + SMALL_PX * rng.standard_normal((count, k, 2))
+    observations = Observations(
+        np.r_[o.frame, np.tile(np.arange(k), count)],
+        np.r_[o.point, np.repeat(n + np.arange(count), k)],
+        np.r_[o.pixels, xy.reshape(-1, 2)],
+    )
+    distance = np.linalg.norm(body, axis=1)
+    truth = replace(
+        truth,
+        bearing=np.r_[truth.bearing, body / distance[:, None]],
+        inverse_distance=np.r_[truth.inverse_distance, 1.0 / distance],
+    )
+    return replace(problem, truth=truth, points=np.r_[points, body], observations=observations), n
+
+
+@pytest.mark.parametrize("count", [40, 120])
+def test_groups_are_the_scene_and_the_body(count):
+    problem, scene = with_follower(count, 0.4)
+    o = problem.observations
+    groups = turning_groups(o, problem.truth.normalized(o), problem.focal)
+    assert len(groups) >= 2
+    assert all(group[:scene].all() or not group[:scene].any() or not group[scene:].any() for group in groups)
+    assert not (groups[0][:scene].any() and groups[0][scene:].any())
+    assert max(group[:scene].mean() for group in groups) > 0.6
+
+
+def test_what_turns_together_is_no_group():
+    problem = make_problem("handheld", frames=16, points=160, parallax=0.005, noise_px=SMALL_PX)
+    o = problem.observations
+    assert turning_groups(o, problem.truth.normalized(o), problem.focal) == []
+
+
+@pytest.mark.parametrize("count", [60, 140])
+def test_a_solution_that_went_with_both_is_given_up(count):
+    problem, scene = with_follower(count, 0.4)
+    wrong = solution_from(perturbed(problem.truth, structure=0.2), problem.observations, PolishOptions())
+    rotations = problem.truth.rotation
+    assert problem.focal * angles_between(wrong.state.rotation, rotations).max() > 3.0
+    found = best_solution(wrong.state, problem.observations, Options())
+    assert not (found.kept >= scene).any()
+    assert len(found.kept) > 0.9 * scene
+    assert 0.01 < problem.focal * angles_between(found.adjustment.state.rotation, rotations).max() < 0.6
+    assert 0.0 < found.rival < 1.0
+
+
+def test_a_young_map_begins_again_without_the_body():
+    problem, scene = with_follower(120, 0.4, frames=5)
+    wrong = solution_from(perturbed(problem.truth, structure=0.2), problem.observations, PolishOptions())
+    images = mapped_images(problem, wrong.state, guided=range(4))
+    points = PointMap()
+    points.set(np.arange(len(problem.points)), wrong.state.points)
+    update = update_map(MapCopy(images, points, MapperOptions(), problem.focal), KeyframeGraph())
+    assert update.committed
+    assert not (update.ids >= scene).any()
+    assert update.moving > 100
+    assert "move by themselves" in update.note
+    turn = [angles_between(r[None], problem.truth.rotation[k][None])[0] for k, (r, _) in update.poses.items()]
+    assert 1e-6 < problem.focal * max(turn) < 1.5
