@@ -23,7 +23,7 @@ from factorsfm.mapping.mapped_images import MappedImage, state_of
 from factorsfm.mapping.registration import register_image
 from factorsfm.mapping.starts import lift
 from factorsfm.motion.burn_ins import contradicts, resting
-from factorsfm.motion.readings import Reading, most_likely
+from factorsfm.motion.readings import Reading, most_likely, solution_from
 from factorsfm.motion.turning import turning_groups
 from factorsfm.support.options import PolishOptions
 
@@ -49,7 +49,8 @@ def scene_alone(copy: MapCopy, images: list[MappedImage], window: Window, ids: I
         return window.ids
     seen = gather([image.tracks for image in images], ids, copy.focal)
     state = state_of(images, copy.points.at(ids), copy.focal)
-    readings = [Reading(np.searchsorted(ids, window.ids), known)]
+    together = solution_from(known.state, known.observations, _READING)
+    readings = [Reading(np.searchsorted(ids, window.ids), together)]
     for group in turning_groups(seen, state.normalized(seen), copy.focal):
         if len(np.unique(seen.of(np.flatnonzero(group)).frame)) == len(images):
             readings.append(from_group(group, state, seen, _READING))

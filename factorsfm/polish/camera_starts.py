@@ -31,7 +31,7 @@ _DOUBTFUL_INFLATION = 8.0  # see `error_inflation`; right solutions have 1 to 6,
 _CLEARLY = 0.9  # of the cost of the solution from the incremental map, below which another one is preferred
 _ROUNDS = 3  # in which what moves is left out
 _CORE_TRACKS = 400  # on which the cameras are solved first
-_CELLS, _CELL_TRACKS = (8, 5), 10  # across and down, and the tracks of each with which an unknown lens is estimated
+_CELLS, _CELL_TRACKS = (8, 5), 10  # across and down, and the tracks of each that take part at least
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,11 +148,10 @@ def reversed_scene(part: State) -> State:
     return replace(part, rotation=turn @ part.rotation, translation=-part.translation, inverse_distance=inverse)
 
 
-def core_tracks(observations: Observations, frames: int, *, everywhere: bool = False) -> Index:
-    """Points of the longest tracks, with enough of them in every frame.
+def core_tracks(observations: Observations, frames: int) -> Index:
+    """Points of the longest tracks, with enough of them in each of the frames and in every part of the image.
 
-    Args:
-        frames: how many there are; everywhere: enough of them in every part of the image, too, for the lens.
+    What follows the camera has the longest tracks, and the scene behind it is seen at the rim.
     """
     length = np.bincount(observations.point)
     order = np.argsort(-length, kind="stable")
@@ -164,7 +163,7 @@ def core_tracks(observations: Observations, frames: int, *, everywhere: bool = F
     place = np.arange(len(by_frame)) - first[observations.frame[by_frame]]
     chosen[observations.point[by_frame[place < _CORE_TRACKS // 3]]] = True
     core = np.nonzero(chosen)[0]
-    return np.union1d(core, _everywhere(observations, _CELL_TRACKS)) if everywhere else core
+    return np.union1d(core, _everywhere(observations, _CELL_TRACKS))
 
 
 def _everywhere(observations: Observations, count: int) -> Index:

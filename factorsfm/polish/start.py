@@ -105,7 +105,7 @@ def _solved_core(shot: Shot, frames: list[int], observations: Observations, trac
     """Cameras, lens and shutter on the longest tracks."""
     o = options.polish
     trusted = shot.trusted(tracks)
-    core = trusted[core_tracks(observations.of(trusted), len(frames), everywhere=options.estimates_lens)]
+    core = trusted[core_tracks(observations.of(trusted), len(frames))]
     few = observations.of(core)
     guess = _first_guess(shot, frames, few, tracks[core], _world(observations))
     found = turning_reading(guess, few, options)

@@ -9,7 +9,6 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.adjustment.prior_term import LEAST_CORRELATION
 from factorsfm.control.fit import ControlFit
 from factorsfm.lens.lens import LensEstimate
 from factorsfm.motion.shot_kind import LEAST_GAIN
@@ -49,11 +48,6 @@ def result_doubts(polished: Polished) -> list[str]:
         doubts.append(
             f"A camera that moves explains the tracks hardly better than one that only turns (by {motion.gain:.2f} of "
             f"the noise, {LEAST_GAIN:.1f} is asked for): translation is at the limit of what can be seen."
-        )
-    if polished.contradiction is not None and polished.contradiction < -LEAST_CORRELATION:
-        doubts.append(
-            "The depth prior says the opposite of the geometry, but the reversed scene does not fit the images: the "
-            "lens, what moves by itself, or the prior is wrong."
         )
     if polished.rival > _AS_GOOD:
         doubts.append(
