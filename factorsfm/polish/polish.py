@@ -171,7 +171,7 @@ def _solved(
         *adjustment.observation_sigmas(), start.core.motion, *_pose_covariances(covariance, adjustment.state),
         camera_observability(adjustment, marginals, covariance), point_std,
         left_out, prior, start.core.lens, start.core.shutter, moving=start.core.moving, turns=start.core.turns,
-        rest=start.core.rest, rival=start.core.rival, contradiction=start.depths.correlation,
+        rest=start.core.rest, rival=start.core.rival, inflation=start.inflation, contradiction=start.depths.correlation,
     )  # fmt: skip
     result.describe_prior(adjustment, covariance)
     return adjustment, result

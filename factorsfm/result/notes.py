@@ -23,6 +23,8 @@ _MERGED_GAP = 5  # registered frames between two weak stretches that are told as
 _SHORTEST_STRETCH = 3  # frames
 _MOST_STRETCHES = 2  # sentences of each sort
 _AS_GOOD = 0.9  # cost over that of another reading, from which that is nearly as good
+# Of the variance, since errors of neighbouring tracks are alike: right solutions have 1 to 7, wrong ones 13 to 80.
+_ALIKE = 10.0
 _MOST_OF_THE_IMAGE = 0.5  # resting, from which nobody doubts that the camera is fixed
 
 
@@ -48,6 +50,11 @@ def result_doubts(polished: Polished) -> list[str]:
         doubts.append(
             f"A camera that moves explains the tracks hardly better than one that only turns (by {motion.gain:.2f} of "
             f"the noise, {LEAST_GAIN:.1f} is asked for): translation is at the limit of what can be seen."
+        )
+    if polished.inflation > _ALIKE:
+        doubts.append(
+            "Neighbouring tracks miss alike, far beyond chance: something large moves by itself, or the lens is "
+            "another."
         )
     if polished.rival > _AS_GOOD:
         doubts.append(
