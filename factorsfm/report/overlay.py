@@ -17,6 +17,7 @@ from factorsfm.export.shot import Defaults, make_shot
 from factorsfm.export.writing import complete_file
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.reading import read_frames
+from factorsfm.frames.video import count_frames
 from factorsfm.report.props import Props, place_props
 from factorsfm.report.wording import status_words
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
@@ -132,7 +133,7 @@ def write_overlay(
                 video.write(cv2.copyMakeBorder(image, 0, below, 0, right, cv2.BORDER_REPLICATE))
         finally:
             video.release()
-        if (kept := _count_frames(file)) < len(frames):  # OpenCV says nothing of a full disk
+        if (kept := count_frames(file)) < len(frames):  # OpenCV says nothing of a full disk
             raise OSError(f"only {kept} of {len(frames)} frames are in the file; is the disk full?")
     return props
 
@@ -180,15 +181,6 @@ def _footage(source: Path, reconstruction: Reconstruction) -> Iterator[Frame]:
                 f"frame {index} of {source} has {width}x{height} pixels, the result {camera.width}x{camera.height}"
             )
         yield found
-
-
-def _count_frames(video: Path) -> int:
-    capture = cv2.VideoCapture(str(video))
-    count = 0
-    while capture.grab():
-        count += 1
-    capture.release()
-    return count
 
 
 def _draw_grid(canvas: Image, lines: Array) -> None:
