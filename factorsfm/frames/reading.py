@@ -57,14 +57,11 @@ def read_frames(
             if not images:
                 suffixes = ", ".join(sorted(suffix[1:] for suffix in IMAGE_SUFFIXES))
                 raise InputError(f"folder {path} holds no images ({suffixes})")
-            found = _with_aspect(_folder_frames(images, selection), pixel_aspect)
+            found = with_aspect(_folder_frames(images, selection), pixel_aspect)
         elif path.is_file():
             if path.suffix.lower() in IMAGE_SUFFIXES:
                 raise InputError(f"{path} is a single image; a video file or a folder of images is expected")
-            video = open_video(path)
-            if pixel_aspect is not None:
-                video = replace(video, pixel_aspect=pixel_aspect)
-            found = decode(video, selection, fields)
+            found = with_aspect(decode(open_video(path), selection, fields), pixel_aspect)
         else:
             raise InputError(f"{path} does not exist; a video file or a folder of images is expected")
         return uniform(found, str(path), selection.start)
@@ -76,7 +73,7 @@ def read_frames(
             "a video file, a folder of images or an iterable of images is expected"
         )
     return uniform(
-        _with_aspect(_array_frames(source, selection), pixel_aspect), "the sequence of images", selection.start
+        with_aspect(_array_frames(source, selection), pixel_aspect), "the sequence of images", selection.start
     )
 
 
@@ -115,9 +112,13 @@ def uniform(frames: Iterator[Frame], source: str, start: int) -> Iterator[Frame]
         raise InputError(f"{source} holds no frames" + (f" from number {start} on" if start else ""))
 
 
-def _with_aspect(frames: Iterator[Frame], pixel_aspect: float | None) -> Iterator[Frame]:
-    """The frames with the given pixel aspect, or with their own."""
-    return frames if pixel_aspect is None else (replace(frame, pixel_aspect=pixel_aspect) for frame in frames)
+def with_aspect(frames: Iterator[Frame], pixel_aspect: float | None) -> Iterator[Frame]:
+    """The frames with another pixel aspect, which is that of whole frames; None leaves them as they are."""
+    for frame in frames:
+        if pixel_aspect is None:
+            yield frame
+        else:
+            yield replace(frame, pixel_aspect=pixel_aspect * (0.5 if frame.is_field else 1.0))
 
 
 def _array_frames(

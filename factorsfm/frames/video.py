@@ -182,7 +182,8 @@ class _Converter:
             position = index % 2
             image = splitter.centered(self._picture.bgr(fields[position])[:lines], position)
             moment = None if time is None else time + 0.5 * position * self._interval(frame)
-            yield Frame(index, video.orientation.applied(image), f"{index:06d}", moment, pixel_aspect=aspect)
+            image = video.orientation.applied(image)
+            yield Frame(index, image, f"{index:06d}", moment, pixel_aspect=aspect, is_field=True)
 
     def _interval(self, frame: av.VideoFrame) -> float:
         """Seconds that a frame is shown."""

@@ -14,7 +14,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.camera.files import check_camera
+from factorsfm.camera.files import fitted_camera
 from factorsfm.camera.guess import guess_camera
 from factorsfm.control.known import Control
 from factorsfm.frames.frame import Frame, as_frame
@@ -357,9 +357,9 @@ class Stream(Closing):
         check_size(frame, None)
         height, width = frame.image.shape[:2]
         if self.camera is None:
-            self.camera = guess_camera(width, height, frame.path)
+            self.camera = guess_camera(width, height, frame.path, frame.pixel_aspect)
             self.options = self.options.for_unknown_lens()
-        check_camera(self.camera, width, height)
+        self.camera = fitted_camera(self.camera, width, height, frame.pixel_aspect)
         if self.options.estimates_lens:
             distortion_of(self.camera)  # refuses what cannot be estimated
         self._size = (width, height)
