@@ -31,10 +31,12 @@ class RepeatDetector:
         if before is None:
             return False
         difference = float(np.abs(image - before).mean())
-        known = len(self._differences) >= _LEAST_AROUND and self._in_a_row < _MOST_IN_A_ROW
+        known = len(self._differences) >= _LEAST_AROUND
         if known and difference < _REPEATED * float(np.median(self._differences)):
             self._in_a_row += 1
-            return True
+            if self._in_a_row <= _MOST_IN_A_ROW:
+                return True
+            self._differences.clear()  # the camera stands: new frames differ as little from here on
         self._in_a_row = 0
         self._differences.append(difference)
         return False

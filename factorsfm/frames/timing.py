@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 _UNEVEN = 0.2
 
 _LONGEST_PERIOD = 12  # frames: telecine has 5, animation 4 at most
-_REGULAR = 0.9  # share of the frames that a cadence has to explain, since a repeat may be missed
+# What a cadence has to explain of the repeats, or all but one: the first repeat of a shot is missed.
+_REGULAR, _LEAST_REPEATS = 0.9, 3
 
 
 def frame_interval(indices: Sequence[int], timestamps: Sequence[float | None]) -> float:
@@ -46,6 +47,11 @@ def frame_times(indices: Sequence[int], timestamps: Sequence[float | None]) -> N
     return times - times[0] + even[0] if uneven else even
 
 
+def are_uneven(indices: Sequence[int], timestamps: Sequence[float | None]) -> bool:
+    """Whether frames come at uneven times; arguments as in `frame_times`."""
+    return not np.array_equal(frame_times(indices, timestamps), indices)
+
+
 def cadence(repeated: Sequence[bool]) -> tuple[int, int] | None:
     """The rhythm of frames that repeat the one before: in every so many frames so many are new; None without one.
 
@@ -56,6 +62,7 @@ def cadence(repeated: Sequence[bool]) -> tuple[int, int] | None:
     for period in range(2, min(_LONGEST_PERIOD, len(flags) // 3) + 1):
         pattern = np.array([flags[phase::period].mean() > 0.5 for phase in range(period)])
         expected = np.resize(pattern, len(flags))
-        if pattern.any() and (expected & flags).sum() >= _REGULAR * (expected | flags).sum():
+        matched, either = int((expected & flags).sum()), int((expected | flags).sum())
+        if matched >= max(min(_REGULAR * either, either - 1), _LEAST_REPEATS):
             return period, int((~pattern).sum())
     return None

@@ -15,6 +15,7 @@ from factorsfm.camera.projection import PIXEL_CENTER
 from factorsfm.export.options import ExportOptions
 from factorsfm.export.shot import Defaults, make_shot
 from factorsfm.export.writing import complete_file
+from factorsfm.frames.fields import Fields
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.reading import read_frames
 from factorsfm.frames.video import count_frames
@@ -125,7 +126,7 @@ def write_overlay(
         if not video.isOpened():
             raise InputError(f"OpenCV cannot write the video {path}")
         try:
-            for position, frame in enumerate(_footage(shot.footage, reconstruction)):
+            for position, frame in enumerate(_footage(shot.footage, reconstruction, shot.fields)):
                 if progress is not None:
                     progress("overlay", position, len(frames))
                 image = draw_overlay(reconstruction, position, frame.image, props, projector, layers)
@@ -167,10 +168,10 @@ def draw_overlay(
     return canvas
 
 
-def _footage(source: Path, reconstruction: Reconstruction) -> Iterator[Frame]:
+def _footage(source: Path, reconstruction: Reconstruction, fields: Fields) -> Iterator[Frame]:
     """The frames of the reconstruction, in order."""
     camera, wanted = reconstruction.camera, [frame.index for frame in reconstruction.frames]
-    images = read_frames(source, slice(wanted[0], wanted[-1] + 1))
+    images = read_frames(source, slice(wanted[0], wanted[-1] + 1), fields=fields)
     for index in wanted:
         found = next((image for image in images if image.index == index), None)
         if found is None:

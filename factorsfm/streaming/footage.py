@@ -17,7 +17,7 @@ from factorsfm.camera.files import fitted_camera
 from factorsfm.camera.guess import guess_camera
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.repeats import RepeatDetector
-from factorsfm.frames.timing import cadence, frame_interval, frame_times
+from factorsfm.frames.timing import are_uneven, cadence, frame_interval, frame_times
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.streaming.frame_update import FrameUpdate, SeenFrame, repeated_update
 
@@ -153,7 +153,7 @@ class Footage:
         interval, rhythm = frame_interval(indices, timestamps), self._cadence(frames)
         if self.repeats:
             notes.append(f"{self._repeats_said(rhythm, interval)} They have the pose of the frame that they repeat.")
-        if rhythm is None and not np.array_equal(frame_times(indices, timestamps), indices):
+        if rhythm is None and are_uneven(indices, timestamps):
             steps = np.diff(np.array(timestamps, np.float64)) / np.diff(indices)
             notes.append(
                 f"Frames come at uneven times, {1e3 * steps.min():.0f} to {1e3 * steps.max():.0f} ms after one "
