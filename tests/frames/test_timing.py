@@ -72,6 +72,14 @@ def test_images_that_all_are_the_same_repeat_none():
     assert not any(detector.push(moving_texture(1)[0][:, :, 0]) for _ in range(20))
 
 
+@pytest.mark.parametrize("shown", [0, 255])
+def test_new_frames_after_a_blank_stretch_repeat_none(shown):
+    """The step into the image is large, beside which its motion is small."""
+    blank = np.full((240, 320), shown, np.uint8)
+    detector = RepeatDetector()
+    assert not any(detector.push(image) for image in [blank] * 2 + [i[:, :, 0] for i in moving_texture(10, 0.3)])
+
+
 def test_a_camera_that_stops_is_no_long_row_of_repeats():
     images = moving_texture(12, 2.0)
     detector = RepeatDetector()
