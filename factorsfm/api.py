@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, get_args
 
@@ -15,10 +16,11 @@ from numpy.typing import NDArray
 
 from factorsfm.camera.files import open_camera
 from factorsfm.control.known import Control, find_frames, read_control
+from factorsfm.frames.fields import Fields
 from factorsfm.frames.folders import list_images
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.ranges import checked_range, range_text
-from factorsfm.frames.reading import read_frames
+from factorsfm.frames.reading import check_footage, read_frames
 from factorsfm.frames.unordered import looks_unordered, other_files, read_images
 from factorsfm.imagesets.image_set import ImageSet
 from factorsfm.imagesets.photo_folder import work_folder
@@ -47,6 +49,8 @@ def reconstruct(
     masks: str | Path | MaskPrior | None = None,
     objects: str | Path | ObjectMasks | None = None,
     frames: slice | None = None,
+    fields: Fields = "auto",
+    pixel_aspect: float | None = None,
     preset: str = "default",
     lens: LensFreedom = "auto",
     shutter: ShutterUse = "auto",
@@ -71,6 +75,7 @@ def reconstruct(
         objects: masks of rigid things in a video that move by themselves and are solved, too: a folder (`ObjectFolder`)
             or any `ObjectMasks`; the scene ignores them. They are `Reconstruction.objects` of the result.
         frames: range of the source's frames.
+        fields, pixel_aspect: of a shot, see `read_frames`.
         preset: see `options.PRESETS`.
         lens: what of the lens is estimated where the shot determines it, see `Options`.
         shutter: what is done with a rolling shutter, see `Options`.
@@ -91,6 +96,7 @@ def reconstruct(
     begin = time.perf_counter()
     _check_choice("lens", lens, get_args(LensFreedom))
     _check_choice("shutter", shutter, get_args(ShutterUse))
+    check_footage(fields, pixel_aspect)
     options = replace(Options.preset_named(preset), lens=lens, shutter=shutter)
     camera = open_camera(camera)
     frames = checked_range(frames) if frames is not None else None
@@ -105,18 +111,21 @@ def reconstruct(
         raise InputError("an IMU goes with a video; images in any order have no times")
     if unordered and object_masks is not None:
         raise InputError("objects are tracked in a video; images in any order show no motion")
+    if unordered and (fields != "auto" or pixel_aspect is not None):
+        raise InputError("fields and pixel aspect are of a shot; images in any order take their pixels as square")
+    footage = partial(read_frames, source, frames, fields=fields, pixel_aspect=pixel_aspect)
     if unordered:
         result = _from_images(source, frames, camera, prior, mask_prior, options, known, features, work, progress)
     else:
         result = _from_shot(
-            source, frames, camera, prior, mask_prior, object_masks, options, known, recording, progress
+            source, footage, camera, prior, mask_prior, object_masks, options, known, recording, progress
         )
     said = {
         "source": str(source) if isinstance(source, str | Path) else "frames",
         "unordered": unordered,
         "features": str(features),
         "objects": getattr(object_masks, "name", type(object_masks).__name__) if object_masks is not None else None,
-        **input_options(prior, mask_prior, frames),
+        **input_options(prior, mask_prior, frames, fields, pixel_aspect),
     }
     for part in (result, *result.others):
         part.seconds["total"] = time.perf_counter() - begin
@@ -136,19 +145,27 @@ def _check_control(control: Control | None, source: object, frames: slice | None
         find_frames(control, names[frames or slice(None)])
 
 
-def input_options(depth: DepthPrior | None, masks: MaskPrior | None, frames: slice | None) -> dict[str, Any]:
-    """What is written beside the options of a result: the names of its priors, and its range."""
+def input_options(
+    depth: DepthPrior | None,
+    masks: MaskPrior | None,
+    frames: slice | None,
+    fields: Fields = "auto",
+    pixel_aspect: float | None = None,
+) -> dict[str, Any]:
+    """What is written beside the options of a result: the names of its priors, its range, how footage was read."""
     return {
         "depth": depth.name if depth is not None else None,
         "depth_kind": str(depth.kind) if depth is not None else None,
         "masks": getattr(masks, "name", type(masks).__name__) if masks is not None else None,
         "frames": range_text(frames) if frames is not None else None,
+        "fields": fields,
+        "pixel_aspect": pixel_aspect,
     }
 
 
 def _from_shot(
     source: str | Path | Iterable[Frame | NDArray[np.uint8]],
-    frames: slice | None,
+    footage: Callable[[], Iterator[Frame]],
     camera: pycolmap.Camera | None,
     depth: DepthPrior | None,
     masks: MaskPrior | None,
@@ -164,7 +181,7 @@ def _from_shot(
             shared = remembered = RememberedDepth(depth) if depth is not None else None
             seen = observed = held.enter_context(ObservedObjects(objects, masks, remembered, options.tracker))
         stream = held.enter_context(Stream(camera, depth=shared, masks=seen, options=options, control=control, imu=imu))
-        for done, frame in enumerate(read_frames(source, frames)):
+        for done, frame in enumerate(footage()):
             if progress is not None:
                 progress("frames", done, None)
             stream.push(frame)

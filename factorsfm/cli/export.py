@@ -10,6 +10,7 @@ from factorsfm.cli.command import Command
 from factorsfm.cli.progress_line import ProgressLine
 from factorsfm.export.formats import FORMATS, export
 from factorsfm.export.options import ExportOptions, UpAxis
+from factorsfm.frames.timing import are_uneven
 from factorsfm.result.reading import read_result
 
 
@@ -42,7 +43,10 @@ def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
     export(reconstruction, arguments.output, format=arguments.format, options=options)
     lost = len(reconstruction.frames) - len(reconstruction.registered)
     without = f"; {lost} of {len(reconstruction.frames)} frames are not registered and have no camera" if lost else ""
-    return f"Wrote {arguments.format} ({FORMATS[arguments.format].description}) to {arguments.output}{without}."
+    times = [frame.timestamp for frame in reconstruction.frames]
+    uneven = arguments.format != "tum" and are_uneven([frame.index for frame in reconstruction.frames], times)
+    rate = "; its frames come at uneven times, and here each lasts as long as any other" if uneven else ""
+    return f"Wrote {arguments.format} ({FORMATS[arguments.format].description}) to {arguments.output}{without}{rate}."
 
 
 def _formats_help() -> str:

@@ -13,6 +13,7 @@ import pycolmap
 from factorsfm.export.image_names import image_name
 from factorsfm.export.ply import write_ply
 from factorsfm.export.shot import Shot
+from factorsfm.frames.fields import Fields
 from factorsfm.frames.reading import read_frames
 from factorsfm.frames.writing import write_image
 from factorsfm.result.image_sources import image_sources
@@ -73,7 +74,7 @@ def write_nerfstudio(shot: Shot, folder: Path) -> None:
         if source.path is None and here:
             logger.warning("there are no files of %s: put these images into images/", ", ".join(here.values()))
         elif source.path is not None and here:
-            _write_images(source.path, here, folder / "images")
+            _write_images(source.path, here, folder / "images", shot.fields)
 
 
 def _lens(camera: pycolmap.Camera) -> dict[str, Any]:
@@ -94,11 +95,11 @@ def _lens(camera: pycolmap.Camera) -> dict[str, Any]:
     }
 
 
-def _write_images(footage: Path, names: dict[int, str], folder: Path) -> None:
+def _write_images(footage: Path, names: dict[int, str], folder: Path, fields: Fields) -> None:
     """Copy image files, and write the frames of a video as images without loss.
 
     Args:
-        names: of the images, by index in the footage.
+        names: of the images, by index in the footage; fields: as in `read_frames`.
     """
     for name in names.values():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -108,7 +109,7 @@ def _write_images(footage: Path, names: dict[int, str], folder: Path) -> None:
     if not missing:
         return
     indices = sorted(missing)
-    for frame in read_frames(footage, slice(indices[0], indices[-1] + 1)):
+    for frame in read_frames(footage, slice(indices[0], indices[-1] + 1), fields=fields):
         if frame.index not in missing:
             continue
         missing.remove(frame.index)

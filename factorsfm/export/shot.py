@@ -11,6 +11,7 @@ import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pycolmap
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from factorsfm.export.moving import MovingNull, moving_nulls, object_in_world
 from factorsfm.export.options import ExportOptions, UpAxis
+from factorsfm.frames.fields import Fields
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.support.errors import InputError
 
@@ -161,6 +163,12 @@ class Shot:
     def lenses(self) -> list[Lens]:
         """The lens of each registered frame."""
         return [self._pinhole(self.reconstruction.camera_of(frame)) for frame in self.reconstruction.registered]
+
+    @property
+    def fields(self) -> Fields:
+        """How the frames of the footage are read: as those of the result were."""
+        said = self.reconstruction.options.get("fields")
+        return next((known for known in get_args(Fields) if known == said), "auto")
 
     @property
     def zooms(self) -> bool:

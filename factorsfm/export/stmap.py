@@ -55,7 +55,7 @@ def write_undistorted(shot: Shot, folder: Path) -> None:
         raise InputError("there is no footage to undistort; name a video file or a folder of images")
     own = {frame.index: frame.camera for frame in shot.reconstruction.frames if frame.camera is not None}
     x, y = _straightening(camera)
-    for frame in read_frames(shot.footage):
+    for frame in read_frames(shot.footage, fields=shot.fields):
         height, width = frame.image.shape[:2]
         if (width, height) != (camera.width, camera.height):
             raise InputError(

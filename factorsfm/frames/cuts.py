@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.frames.block_matching import Thumbnail, dissimilarity, dissolve_variances
+from factorsfm.frames.fields import Fields
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.reading import read_frames
 from factorsfm.support.errors import InputError
@@ -229,18 +230,20 @@ class CutDetector:
         return ShotUpdate(index, self._shot.number, True, difference, reason)
 
 
-def find_shots(source: str | Path | Iterable[Frame | NDArray[np.uint8]], frames: slice | None = None) -> list[range]:
+def find_shots(
+    source: str | Path | Iterable[Frame | NDArray[np.uint8]], frames: slice | None = None, *, fields: Fields = "auto"
+) -> list[range]:
     """The shots of a video, each as the range of its frames; blank frames at either end are left out.
 
     Args:
-        source, frames: as in `read_frames`; the ranges count frames of the source.
+        source, frames, fields: as in `read_frames`; the ranges count frames of the source.
 
     Raises:
         InputError: the source cannot be read.
     """
     detector = CutDetector()
     ends: dict[int, tuple[int, int]] = {}  # first and last frame, by the number of the shot
-    for frame in read_frames(source, frames):
+    for frame in read_frames(source, frames, fields=fields):
         shot = detector.push(frame).shot
         if shot is None:
             continue

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.frames.frame import Frame
-from factorsfm.frames.video import quiet_opencv
+from factorsfm.frames.silence import quiet_opencv
 from factorsfm.support.errors import InputError
 from factorsfm.support.json_text import is_text
 

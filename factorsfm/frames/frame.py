@@ -23,6 +23,8 @@ class Frame:
         timestamp: seconds from the start of the video, None if unknown.
         dropped: number of frames of a live source that were dropped right before this one.
         path: the image file, whose EXIF data may hold the focal length; None if the frame is not from an image file.
+        pixel_aspect: width of a shown pixel over its height, 1 for square ones.
+        is_field: whether it is one field of an interlaced frame, half of its lines.
 
     Raises:
         InputError: the name is a path that leaves its folder.
@@ -34,6 +36,8 @@ class Frame:
     timestamp: float | None = None
     dropped: int = 0
     path: Path | None = None
+    pixel_aspect: float = 1.0
+    is_field: bool = False
 
     def __post_init__(self) -> None:
         check_name(self.name)

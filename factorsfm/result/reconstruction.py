@@ -127,6 +127,8 @@ class FrameResult:
         thumbnail: a small JPEG of the image, or None.
         camera: the lens of this frame if the frames do not share one, else None; see `Reconstruction.camera_of`.
         focal_std: relative standard deviation of the focal length of this frame, if it has its own estimate.
+        repeats: index of the frame whose image a video shows here once more; this one has its pose and all else of it,
+            but no observations of its own. None for a new image.
     """
 
     index: int
@@ -146,6 +148,7 @@ class FrameResult:
     thumbnail: bytes | None = None
     camera: pycolmap.Camera | None = None
     focal_std: float | None = None
+    repeats: int | None = None
 
     @property
     def registered(self) -> bool:
