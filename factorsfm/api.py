@@ -17,6 +17,7 @@ from factorsfm.camera.files import open_camera
 from factorsfm.control.known import Control, find_frames, read_control
 from factorsfm.frames.folders import list_images
 from factorsfm.frames.frame import Frame
+from factorsfm.frames.numbering import chosen, missing_numbers, numbered_images, sequence_of
 from factorsfm.frames.ranges import checked_range, range_text
 from factorsfm.frames.reading import read_frames
 from factorsfm.frames.unordered import looks_unordered, other_files, read_images
@@ -98,9 +99,9 @@ def reconstruct(
     mask_prior, object_masks = open_masks(masks), open_objects(objects)
     known = read_control(control) if isinstance(control, str | Path) else control
     recording = open_imu(imu) if isinstance(imu, str | Path) else imu
-    _check_control(known, source, frames)
     if unordered is None:
         unordered = isinstance(source, str | Path) and looks_unordered(Path(source), frames)
+    _check_control(known, source, frames, unordered=unordered)
     if unordered and recording is not None:
         raise InputError("an IMU goes with a video; images in any order have no times")
     if unordered and object_masks is not None:
@@ -116,7 +117,7 @@ def reconstruct(
         "unordered": unordered,
         "features": str(features),
         "objects": getattr(object_masks, "name", type(object_masks).__name__) if object_masks is not None else None,
-        **input_options(prior, mask_prior, frames),
+        **input_options(source, prior, mask_prior, frames),
     }
     for part in (result, *result.others):
         part.seconds["total"] = time.perf_counter() - begin
@@ -129,16 +130,23 @@ def _check_choice(name: str, value: str, expected: tuple[str, ...]) -> None:
         raise InputError(f"unknown {name} '{value}', expected one of {', '.join(expected)}")
 
 
-def _check_control(control: Control | None, source: object, frames: slice | None) -> None:
+def _check_control(control: Control | None, source: object, frames: slice | None, *, unordered: bool) -> None:
     """Before the long work: a folder has all frames that the control names."""
     if control is not None and isinstance(source, str | Path) and Path(source).is_dir():
-        names = [(index, path.name) for index, path in enumerate(list_images(Path(source)))]
-        find_frames(control, names[frames or slice(None)])
+        if unordered:
+            names = [(index, path.name) for index, path in enumerate(list_images(Path(source)))][frames or slice(None)]
+        else:
+            images = chosen(numbered_images(Path(source)), frames or checked_range(slice(None)))
+            names = [(number, path.name) for number, path in images]
+        find_frames(control, names)
 
 
-def input_options(depth: DepthPrior | None, masks: MaskPrior | None, frames: slice | None) -> dict[str, Any]:
-    """What is written beside the options of a result: the names of its priors, and its range."""
+def input_options(
+    source: object, depth: DepthPrior | None, masks: MaskPrior | None, frames: slice | None
+) -> dict[str, Any]:
+    """What is written beside the options of a result: the number that a sequence begins with, priors, and range."""
     return {
+        "first_number": numbers[0] if (numbers := sequence_of(source)) else None,
         "depth": depth.name if depth is not None else None,
         "depth_kind": str(depth.kind) if depth is not None else None,
         "masks": getattr(masks, "name", type(masks).__name__) if masks is not None else None,
@@ -175,6 +183,8 @@ def _from_shot(
             raise InputError(f"no frames in {source}")
         check_matched(source, depth, masks, objects)
         result = stream.finish(progress)
+        if sequence_of(source) and (gaps := missing_numbers([frame.index for frame in result.frames])):
+            result.notes.append(f"The numbering of the frames has gaps: {gaps} are missing.")
         if observed is not None:
             if progress is not None:
                 progress("objects", 0, None)

@@ -91,7 +91,8 @@ def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
         resumed = held.enter_context(_resumed(arguments, shown)) if arguments.resume else None
         target: Stream | Episode | None = resumed
         with _open_source(arguments, given) as source:
-            results = StreamResults(arguments, source, begin, input_options(given.depth, given.masks, given.frames))
+            inputs = input_options(arguments.source, given.depth, given.masks, given.frames)
+            results = StreamResults(arguments, source, begin, inputs)
             line = _Line(progress.show, source, arguments.cuts)
             with first_interrupt() as interrupt:
                 for frame in interrupt.until(_after(source, resumed, arguments.source)):

@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.frames.folders import IMAGE_SUFFIXES, list_images, read_image
+from factorsfm.frames.folders import IMAGE_SUFFIXES, read_image
 from factorsfm.frames.frame import Frame, bgr_image
+from factorsfm.frames.numbering import chosen, numbered_images
 from factorsfm.frames.ranges import checked_range
 from factorsfm.frames.video import decode, has_timestamps
 from factorsfm.support.errors import InputError
@@ -26,13 +27,15 @@ def read_frames(
 ) -> Iterator[Frame]:
     """Read the frames of a shot one by one, in bounded memory.
 
-    Grey, 16-bit and alpha images become 8-bit BGR; the EXIF orientation is applied.
+    Grey, 16-bit and alpha images become 8-bit BGR, linear light (EXR, floating-point TIFF) through one tone curve
+    (`tone.tone_curve`); the EXIF orientation is applied.
 
     Args:
         source: a video file; a folder of images, in natural order (img2 before img10), whose other files are ignored;
             an iterable of images, (h, w), (h, w, 3) or (h, w, 4), uint8 or uint16; or an iterable of `Frame` objects,
             which keep their index, name and timestamp.
-        frames: the range to read, for example ``slice(0, 100, 2)``; no negative numbers.
+        frames: the range to read, for example ``slice(0, 100, 2)``; no negative numbers. It counts as the frames do
+            (`Frame.index`): ``slice(1001, 1101)`` are the first 100 frames of a sequence that begins at 1001.
 
     Raises:
         InputError: at the call, if the source does not exist, is not a video or holds no images; while iterating, if an
@@ -42,11 +45,7 @@ def read_frames(
     if isinstance(source, (str, Path)):
         path = Path(source)
         if path.is_dir():
-            images = list_images(path)
-            if not images:
-                suffixes = ", ".join(sorted(suffix[1:] for suffix in IMAGE_SUFFIXES))
-                raise InputError(f"folder {path} holds no images ({suffixes})")
-            found = _folder_frames(images, selection)
+            found = _folder_frames(chosen(numbered_images(path), selection))
         elif path.is_file():
             if path.suffix.lower() in IMAGE_SUFFIXES:
                 raise InputError(f"{path} is a single image; a video file or a folder of images is expected")
@@ -90,17 +89,17 @@ def uniform(frames: Iterator[Frame], source: str, start: int) -> Iterator[Frame]
 def _array_frames(
     images: Iterable[NDArray[np.uint8] | NDArray[np.uint16] | Frame], selection: slice
 ) -> Iterator[Frame]:
-    chosen = itertools.islice(enumerate(images), selection.start, selection.stop, selection.step)
-    for index, image in chosen:
+    taken = itertools.islice(enumerate(images), selection.start, selection.stop, selection.step)
+    for index, image in taken:
         if isinstance(image, Frame):
             yield replace(image, image=bgr_image(image.image, index))
         else:
             yield Frame(index, bgr_image(image, index), f"{index:06d}")
 
 
-def _folder_frames(paths: list[Path], selection: slice) -> Iterator[Frame]:
-    for index in range(len(paths))[selection]:
-        yield Frame(index, read_image(paths[index]), paths[index].name, path=paths[index])
+def _folder_frames(images: list[tuple[int, Path]]) -> Iterator[Frame]:
+    for number, path in images:
+        yield Frame(number, read_image(path), path.name, path=path)
 
 
 def _video_frames(path: Path, selection: slice, *, timed: bool) -> Iterator[Frame]:
