@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, get_args
 
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from factorsfm.camera.files import open_camera
 from factorsfm.control.known import Control, find_frames, read_control
+from factorsfm.frames.edits import AnotherView, LeftOut, left_out_of, read_edit, until_another_view
 from factorsfm.frames.folders import list_images
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.numbering import chosen, missing_numbers, numbered_images, sequence_of
@@ -30,12 +32,14 @@ from factorsfm.priors.depth import DepthFolder, DepthPrior, open_depth
 from factorsfm.priors.depth_map import DepthKind
 from factorsfm.priors.masks import MaskFolder, MaskPrior, open_masks
 from factorsfm.priors.object_masks import ObjectFolder, ObjectMasks, open_objects
+from factorsfm.result.left_out import add_left_out
 from factorsfm.result.objects import add_objects
-from factorsfm.result.reconstruction import Reconstruction
+from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.streaming.stream import Stream
-from factorsfm.support.errors import InputError
+from factorsfm.support.errors import InputError, ReconstructionError
 from factorsfm.support.options import LensFreedom, Options, ShutterUse
 from factorsfm.support.progress import Progress
+from factorsfm.support.status import FrameStatus
 from factorsfm.support.threads import OneThreadEach
 
 
@@ -87,7 +91,7 @@ def reconstruct(
 
     Raises:
         InputError: the source, the camera or a prior cannot be used.
-        ReconstructionError: the shot cannot be reconstructed.
+        ReconstructionError: the shot cannot be reconstructed, or the file or folder holds several shots.
     """
     begin = time.perf_counter()
     _check_choice("lens", lens, get_args(LensFreedom))
@@ -109,9 +113,11 @@ def reconstruct(
     if unordered:
         result = _from_images(source, frames, camera, prior, mask_prior, options, known, features, work, progress)
     else:
-        result = _from_shot(
-            source, frames, camera, prior, mask_prior, object_masks, options, known, recording, progress
-        )
+        solve = partial(
+            _solve, source=source, camera=camera, depth=prior, masks=mask_prior, objects=object_masks, options=options,
+            control=known, imu=recording, progress=progress,
+        )  # fmt: skip
+        result = _from_shot(source, frames, solve)
     said = {
         "source": str(source) if isinstance(source, str | Path) else "frames",
         "unordered": unordered,
@@ -157,6 +163,34 @@ def input_options(
 def _from_shot(
     source: str | Path | Iterable[Frame | NDArray[np.uint8]],
     frames: slice | None,
+    solve: Callable[[Iterator[Frame], Sequence[LeftOut]], Reconstruction],
+) -> Reconstruction:
+    """The one shot of a source; of a file or folder without the slates and bars beside it.
+
+    Raises:
+        ReconstructionError: there are several shots, or as in `Stream.finish`.
+    """
+    images = read_frames(source, frames)
+    if not isinstance(source, str | Path):
+        return solve(images, ())
+    try:
+        result = solve(until_another_view(images), ())
+    except AnotherView:
+        edit = read_edit(source, frames)
+        if len(edit.starts) > 1:
+            raise ReconstructionError(edit.cuts) from None
+        result = solve(read_frames(source, frames), edit.left_out)
+        result.notes[:0] = [f"{part.said[0].upper()}{part.said[1:]}: left out." for part in edit.left_out]
+    if sequence_of(source) and (gaps := missing_numbers([frame.index for frame in result.frames])):
+        result.notes.append(f"The numbering of the frames has gaps: {gaps} are missing.")
+    return result
+
+
+def _solve(
+    images: Iterator[Frame],
+    left_out: Sequence[LeftOut],
+    *,
+    source: object,
     camera: pycolmap.Camera | None,
     depth: DepthPrior | None,
     masks: MaskPrior | None,
@@ -172,9 +206,13 @@ def _from_shot(
             shared = remembered = RememberedDepth(depth) if depth is not None else None
             seen = observed = held.enter_context(ObservedObjects(objects, masks, remembered, options.tracker))
         stream = held.enter_context(Stream(camera, depth=shared, masks=seen, options=options, control=control, imu=imu))
-        for done, frame in enumerate(read_frames(source, frames)):
+        beside: list[FrameResult] = []
+        for done, frame in enumerate(images):
             if progress is not None:
                 progress("frames", done, None)
+            if reason := left_out_of(left_out, frame.index):
+                beside.append(FrameResult(frame.index, frame.name, frame.timestamp, FrameStatus.LEFT_OUT, reason))
+                continue
             stream.push(frame)
             if observed is not None:
                 with stream.seconds.of("objects"):
@@ -183,14 +221,14 @@ def _from_shot(
             raise InputError(f"no frames in {source}")
         check_matched(source, depth, masks, objects)
         result = stream.finish(progress)
-        if sequence_of(source) and (gaps := missing_numbers([frame.index for frame in result.frames])):
-            result.notes.append(f"The numbering of the frames has gaps: {gaps} are missing.")
         if observed is not None:
             if progress is not None:
                 progress("objects", 0, None)
             with stream.seconds.of("objects"), OneThreadEach():
                 add_objects(result, observed, options)
             result.seconds["objects"] = stream.seconds["objects"]
+        if beside:
+            add_left_out(result, beside)
         return result
 
 
