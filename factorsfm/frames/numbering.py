@@ -66,8 +66,10 @@ def chosen(images: list[tuple[int, Path]], frames: slice) -> list[tuple[int, Pat
     stop = last + 1 if frames.stop is None else frames.stop
     found = [(number, path) for number, path in images if number in range(start, max(stop, start), frames.step)]
     if not found:
-        wanted = f"{frames.start} on" if frames.stop is None else f"{frames.start} to {frames.stop - 1}"
-        raise InputError(f"{images[0][1].parent} holds no frames from {wanted}; its frames are {first} to {last}")
+        wanted = f"before number {stop}" if stop <= first else f"from number {frames.start} on"
+        if first < stop <= last and first <= frames.start:
+            wanted = f"with the numbers {frames.start} to {stop - 1}"
+        raise InputError(f"{images[0][1].parent} holds no frames {wanted}; its frames are {first} to {last}")
     return found
 
 

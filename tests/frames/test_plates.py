@@ -188,9 +188,13 @@ def test_range_of_a_sequence_counts_as_its_files_do(sequence, text, numbers):
     assert [int(frame.image[0, 0, 0]) + 1000 for frame in frames] == numbers
 
 
-def test_range_beside_a_sequence_is_refused_with_its_numbers(sequence):
-    with pytest.raises(InputError, match="holds no frames from 0 to 29; its frames are 1001 to 1012"):
-        read_frames(sequence, slice(0, 30))
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [("0:30", "before number 30"), ("1013:", "from number 1013 on"), ("1004:1006", "with the numbers 1004 to 1005")],
+)
+def test_range_beside_a_sequence_is_refused_with_its_numbers(sequence, text, words):
+    with pytest.raises(InputError, match=f"holds no frames {words}; its frames are 1001 to 1012"):
+        read_frames(sequence, parse_range(text))
 
 
 def test_gaps_of_a_sequence_are_named(sequence):
