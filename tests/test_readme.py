@@ -20,6 +20,7 @@ from onnx import helper
 from factorsfm import PRESETS, DepthKind, FrameStatus, ShotKind, open_imu, read_camera, read_control, reconstruct
 from factorsfm.cli import main as cli
 from factorsfm.export import FORMATS
+from factorsfm.frames.writing import write_exr
 from factorsfm.priors import models
 from factorsfm.synthetic import RenderedShot, render_moving, render_shot, write_moving, write_shot
 from tests.instruments import CHECKS, WALK_FRAMES, write_measurements, write_walk
