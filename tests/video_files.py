@@ -99,6 +99,14 @@ def write_video(
     return path
 
 
+def interlaced(path: Path, moments: Sequence[Image], codec: str = "libx264", *, top_first: bool = True) -> Path:
+    """Write moments as interlaced video, two a frame, whose frames are marked."""
+    order = "tff" if top_first else "bff"
+    options = {"x264-params": f"{order}=1"} if codec == "libx264" else {"flags": "+ildct+ilme"}
+    frames = woven(moments, top_first=top_first)
+    return write_video(path, frames, codec, options=options, field_order=order)
+
+
 def _marked(stream: av.VideoStream, field_order: str, unit: Fraction) -> av.filter.Graph:
     """A filter that marks frames as interlaced."""
     graph = av.filter.Graph()

@@ -100,7 +100,11 @@ def add_objects(parser: argparse.ArgumentParser) -> None:
 
 def add_range(parser: argparse.ArgumentParser) -> None:
     """Declare the range of frames."""
-    parser.add_argument("--frames", metavar="START:STOP[:STEP]", help="counted from 0, without STOP")
+    parser.add_argument(
+        "--frames",
+        metavar="START:STOP[:STEP]",
+        help="counted from 0, or by the numbers in the file names of a sequence; without STOP",
+    )
 
 
 def add_footage(parser: argparse.ArgumentParser) -> None:

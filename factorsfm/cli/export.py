@@ -23,7 +23,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--fps", type=float, help="frames per second (default: the source's, else 24)")
     parser.add_argument(
-        "--first-frame", type=int, metavar="NUMBER", help="number of the source's first frame (default: the format's)"
+        "--first-frame",
+        type=int,
+        metavar="NUMBER",
+        help="number of the source's first frame (default: that in its file name, else the format's)",
     )
     parser.add_argument(
         "--sensor-width", type=float, default=36.0, metavar="MM", help="of the film back (default: %(default)g)"
@@ -32,7 +35,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--up-axis", choices=[axis.value for axis in UpAxis], help="in the first frame (default: the format's)"
     )
     parser.add_argument("--scale", type=float, help="exported length of one unit (default: the format's)")
-    parser.add_argument("--footage", type=Path, metavar="VIDEO|FOLDER", help="the shot (default: the source)")
+    parser.add_argument(
+        "--footage",
+        type=Path,
+        metavar="VIDEO|FOLDER",
+        help="the shot, of any size with the same aspect ratio (default: the source)",
+    )
 
 
 def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:

@@ -153,7 +153,9 @@ def _open_inputs(arguments: argparse.Namespace) -> _Inputs:
 
 
 def _said(arguments: argparse.Namespace, given: _Inputs) -> dict[str, Any]:
-    return input_options(given.depth, given.masks, given.frames, arguments.fields, arguments.pixel_aspect)
+    return input_options(
+        arguments.source, given.depth, given.masks, given.frames, arguments.fields, arguments.pixel_aspect
+    )
 
 
 def _open_source(arguments: argparse.Namespace, given: _Inputs) -> Source:

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import statistics
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,8 @@ from factorsfm.frames.fields import Fields
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.reading import read_frames
 from factorsfm.support.errors import InputError
+
+T = TypeVar("T")
 
 _BLANK_SHARE = 0.1  # share of the blocks with texture, below which a frame is black, white or flat
 
@@ -241,13 +244,22 @@ def find_shots(
     Raises:
         InputError: the source cannot be read.
     """
+    shots = by_shot(read_frames(source, frames, fields=fields), list[int], lambda shot, frame: shot.append(frame.index))
+    return [range(shot[0], shot[-1] + 1) for shot in shots]
+
+
+def by_shot(frames: Iterable[Frame], new: Callable[[], T], add: Callable[[T, Frame], None]) -> list[T]:
+    """Collect the frames of each shot, without those that belong to none.
+
+    Args:
+        new: makes an empty collection; add: adds a frame to one.
+    """
     detector = CutDetector()
-    ends: dict[int, tuple[int, int]] = {}  # first and last frame, by the number of the shot
-    for frame in read_frames(source, frames, fields=fields):
+    found: dict[int, T] = {}
+    for frame in frames:
         shot = detector.push(frame).shot
         if shot is None:
             continue
-        first = ends[shot][0] if shot in ends else frame.index
-        ends = {number: pair for number, pair in ends.items() if number <= shot}  # later numbers are now void
-        ends[shot] = (first, frame.index)
-    return [range(first, last + 1) for _, (first, last) in sorted(ends.items())]
+        found = {number: part for number, part in found.items() if number <= shot}  # later numbers are now void
+        add(found.setdefault(shot, new()), frame)
+    return [part for _, part in sorted(found.items())]

@@ -144,7 +144,7 @@ def _open_raw(source: BinaryIO | Literal["-"], raw: RawFormat | None, closed: th
 def _open_files(source: object, selection: slice, fields: Fields) -> _Opened:
     """A folder of images, a video file or an iterable of images."""
     if isinstance(source, str | Path) and Path(source).is_dir() and list_images(Path(source)):
-        return _Opened(str(source), _readable(read_images(source, selection)), is_selected=True)
+        return _Opened(str(source), _readable(read_images(source, selection, numbered=True)), is_selected=True)
     name = str(source) if isinstance(source, str | Path) else "the sequence of images"
     files = cast("str | Path | Iterable[NDArray[np.uint8] | NDArray[np.uint16] | Frame]", source)
     return _Opened(name, read_frames(files, selection, fields=fields), is_selected=True)

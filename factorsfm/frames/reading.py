@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.frames.fields import Fields
-from factorsfm.frames.folders import IMAGE_SUFFIXES, list_images, read_image
+from factorsfm.frames.folders import IMAGE_SUFFIXES, read_image
 from factorsfm.frames.frame import Frame, bgr_image
+from factorsfm.frames.numbering import chosen, numbered_images
 from factorsfm.frames.ranges import checked_range
 from factorsfm.frames.video import decode, open_video
 from factorsfm.support.errors import InputError
@@ -30,14 +31,15 @@ def read_frames(
 ) -> Iterator[Frame]:
     """Read the frames of a shot one by one, in bounded memory.
 
-    Grey, 16-bit, high dynamic range and alpha images become 8-bit BGR; the orientation that EXIF or the container
-    states is applied.
+    Grey, 16-bit, high dynamic range and alpha images become 8-bit BGR, linear light (EXR, floating-point TIFF) through
+    one tone curve (`tone.tone_curve`); the orientation that EXIF or the container states is applied.
 
     Args:
         source: a video file; a folder of images, in natural order (img2 before img10), whose other files are ignored;
             an iterable of images, (h, w), (h, w, 3) or (h, w, 4), uint8 or uint16; or an iterable of `Frame` objects,
             which keep their index, name and timestamp.
-        frames: the range to read, for example ``slice(0, 100, 2)``; no negative numbers.
+        frames: the range to read, for example ``slice(0, 100, 2)``; no negative numbers. It counts as the frames do
+            (`Frame.index`): ``slice(1001, 1101)`` are the first 100 frames of a sequence that begins at 1001.
         fields: what is done with interlaced video. "auto" takes its fields apart: twice the frames, half the lines;
             "apart" does so with any video, "blend" keeps frames whole and blends their fields.
         pixel_aspect: width of a shown pixel over its height (of whole frames, upright), in place of what the container
@@ -53,11 +55,7 @@ def read_frames(
     if isinstance(source, (str, Path)):
         path = Path(source)
         if path.is_dir():
-            images = list_images(path)
-            if not images:
-                suffixes = ", ".join(sorted(suffix[1:] for suffix in IMAGE_SUFFIXES))
-                raise InputError(f"folder {path} holds no images ({suffixes})")
-            found = with_aspect(_folder_frames(images, selection), pixel_aspect)
+            found = with_aspect(_folder_frames(chosen(numbered_images(path), selection)), pixel_aspect)
         elif path.is_file():
             if path.suffix.lower() in IMAGE_SUFFIXES:
                 raise InputError(f"{path} is a single image; a video file or a folder of images is expected")
@@ -124,14 +122,14 @@ def with_aspect(frames: Iterator[Frame], pixel_aspect: float | None) -> Iterator
 def _array_frames(
     images: Iterable[NDArray[np.uint8] | NDArray[np.uint16] | Frame], selection: slice
 ) -> Iterator[Frame]:
-    chosen = itertools.islice(enumerate(images), selection.start, selection.stop, selection.step)
-    for index, image in chosen:
+    taken = itertools.islice(enumerate(images), selection.start, selection.stop, selection.step)
+    for index, image in taken:
         if isinstance(image, Frame):
             yield replace(image, image=bgr_image(image.image, index))
         else:
             yield Frame(index, bgr_image(image, index), f"{index:06d}")
 
 
-def _folder_frames(paths: list[Path], selection: slice) -> Iterator[Frame]:
-    for index in range(len(paths))[selection]:
-        yield Frame(index, read_image(paths[index]), paths[index].name, path=paths[index])
+def _folder_frames(images: list[tuple[int, Path]]) -> Iterator[Frame]:
+    for number, path in images:
+        yield Frame(number, read_image(path), path.name, path=path)

@@ -107,7 +107,7 @@ class FrameResult:
     """One frame of the source.
 
     Attributes:
-        index: position in the source, from 0, before any range or step is applied.
+        index: number of the frame in the source, see `Frame.index`.
         name: file name, perhaps with folders before it, or the zero-padded index.
         timestamp: seconds, None if unknown.
         status, message: whether the frame is registered or why not, and the same in words with numbers.

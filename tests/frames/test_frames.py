@@ -192,7 +192,7 @@ def test_exif_orientation_is_applied(tmp_path):
 
 def test_arrays_are_converted_and_numbered():
     grey = RNG.integers(0, 255, (48, 64), dtype=np.uint8)
-    deep = grey.astype(np.uint16) * 256 + 99
+    deep = grey.astype(np.uint16) * 257 + 99  # less than half of a grey level more
     alpha = np.dstack([grey, grey, grey, grey])
     frames = list(read_frames([grey, deep, alpha, grey[..., None]], slice(0, 4)))
     assert [(frame.index, frame.name, frame.timestamp) for frame in frames[:2]] == [
@@ -244,8 +244,8 @@ def test_file_that_is_no_video_is_refused_at_the_call(tmp_path, content, capfd):
 
 
 def test_pixels_of_another_type_are_named(tmp_path):
-    cv2.imwrite(str(tmp_path / "0.tif"), image(50).astype(np.float32))
-    with pytest.raises(InputError, match=r"0\.tif has pixels of float32; 8 or 16 bits a channel"):
+    cv2.imwrite(str(tmp_path / "0.tif"), image(50).astype(np.float64))
+    with pytest.raises(InputError, match=r"0\.tif has pixels of float64; 8 or 16 bits a channel"):
         next(read_frames(tmp_path))
 
 

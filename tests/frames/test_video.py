@@ -1,7 +1,6 @@
 """Video files as they come: codecs, containers, times, fields, pixel aspect, orientation and colour."""
 
 from fractions import Fraction
-from pathlib import Path
 
 import av
 import cv2
@@ -11,7 +10,7 @@ import pytest
 from factorsfm.frames.ranges import parse_range
 from factorsfm.frames.reading import read_frames
 from factorsfm.support.errors import InputError
-from tests.video_files import BT709, BT2020, FULL, HLG, LIMITED, PQ, moving_texture, woven, write_video
+from tests.video_files import BT709, BT2020, FULL, HLG, LIMITED, PQ, interlaced, moving_texture, woven, write_video
 
 LOSSLESS = {"codec": "ffv1", "pixels": "bgr0"}
 QUIET_H265 = {"x265-params": "log-level=none"}
@@ -99,13 +98,6 @@ def test_uneven_times_are_kept(tmp_path):
 
 
 # --- fields -------------------------------------------------------------------------------------------------------
-
-
-def interlaced(path: Path, moments: list[np.ndarray], codec: str, *, top_first: bool) -> Path:
-    order = "tff" if top_first else "bff"
-    options = {"x264-params": f"{order}=1"} if codec == "libx264" else {"flags": "+ildct+ilme"}
-    frames = woven(moments, top_first=top_first)
-    return write_video(path, frames, codec, options=options, field_order=order)
 
 
 def half_lines(image: np.ndarray) -> np.ndarray:
