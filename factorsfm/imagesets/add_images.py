@@ -147,7 +147,8 @@ class _Extension:
         path = Path(images) if isinstance(images, str | Path) else None
         own = path is not None and main is not None and path.resolve() == Path(str(main)).resolve()
         first = 0 if own else max(used) + 1
-        for image in read_images(images, frames):
+        numbered = own and not self._base.options.get("unordered")
+        for image in read_images(images, frames, numbered=numbered):
             report("new images", len(self._new), None)
             index = first + image.index
             row = row_of.get((index, image.name))
