@@ -148,7 +148,7 @@ class _Extension:
         own = path is not None and main is not None and path.resolve() == Path(str(main)).resolve()
         first = 0 if own else max(used) + 1
         numbered = own and not self._base.options.get("unordered")
-        for image in read_images(images, frames, numbered=numbered):
+        for image in read_images(images, frames, numbered=numbered, fields=fields_of(self._base.options)):
             report("new images", len(self._new), None)
             index = first + image.index
             row = row_of.get((index, image.name))
