@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,7 +30,7 @@ from benchmarks.plan import (
     drawn,
     undrawn,
 )
-from factorsfm import DepthFolder, DepthKind, DepthMap, DepthModel, DepthPrior, Frame, InputError
+from factorsfm import DepthFolder, DepthKind, DepthMap, DepthModel, DepthPrior, Frame, InputError, read_frames
 from factorsfm.evaluation.degrade import degraded_frames
 from factorsfm.evaluation.readers import read_shot
 from factorsfm.evaluation.truth import DepthLookup, Shot
@@ -131,13 +130,8 @@ def compressed_frames(frames: Iterable[Frame], crf: int) -> Iterator[Frame]:
         for frame in originals:
             writer.send(np.ascontiguousarray(frame.image))
         writer.close()
-        capture = cv2.VideoCapture(str(video))
-        for frame in originals:
-            done, image = capture.read()
-            if not done:
-                raise InputError(f"frame {frame.index} is missing in the compressed video")
-            yield replace(frame, image=np.asarray(image, np.uint8))
-        capture.release()
+        for frame, compressed in zip(originals, read_frames(video), strict=True):
+            yield replace(frame, image=compressed.image)
 
 
 class TrueDepthPrior:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, get_args
 
@@ -15,10 +16,13 @@ from numpy.typing import NDArray
 
 from factorsfm.camera.files import open_camera
 from factorsfm.control.known import Control, find_frames, read_control
+from factorsfm.frames.edits import AnotherView, LeftOut, left_out_of, read_edit, until_another_view
+from factorsfm.frames.fields import Fields
 from factorsfm.frames.folders import list_images
 from factorsfm.frames.frame import Frame
+from factorsfm.frames.numbering import chosen, missing_numbers, numbered_images, sequence_of
 from factorsfm.frames.ranges import checked_range, range_text
-from factorsfm.frames.reading import read_frames
+from factorsfm.frames.reading import check_footage, read_frames
 from factorsfm.frames.unordered import looks_unordered, other_files, read_images
 from factorsfm.imagesets.image_set import ImageSet
 from factorsfm.imagesets.photo_folder import work_folder
@@ -29,12 +33,14 @@ from factorsfm.priors.depth import DepthFolder, DepthPrior, open_depth
 from factorsfm.priors.depth_map import DepthKind
 from factorsfm.priors.masks import MaskFolder, MaskPrior, open_masks
 from factorsfm.priors.object_masks import ObjectFolder, ObjectMasks, open_objects
+from factorsfm.result.left_out import add_left_out
 from factorsfm.result.objects import add_objects
-from factorsfm.result.reconstruction import Reconstruction
+from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.streaming.stream import Stream
-from factorsfm.support.errors import InputError
+from factorsfm.support.errors import InputError, ReconstructionError
 from factorsfm.support.options import LensFreedom, Options, ShutterUse
 from factorsfm.support.progress import Progress
+from factorsfm.support.status import FrameStatus
 from factorsfm.support.threads import OneThreadEach
 
 
@@ -47,6 +53,8 @@ def reconstruct(
     masks: str | Path | MaskPrior | None = None,
     objects: str | Path | ObjectMasks | None = None,
     frames: slice | None = None,
+    fields: Fields = "auto",
+    pixel_aspect: float | None = None,
     preset: str = "default",
     lens: LensFreedom = "auto",
     shutter: ShutterUse = "auto",
@@ -71,6 +79,7 @@ def reconstruct(
         objects: masks of rigid things in a video that move by themselves and are solved, too: a folder (`ObjectFolder`)
             or any `ObjectMasks`; the scene ignores them. They are `Reconstruction.objects` of the result.
         frames: range of the source's frames.
+        fields, pixel_aspect: of a shot, see `read_frames`.
         preset: see `options.PRESETS`.
         lens: what of the lens is estimated where the shot determines it, see `Options`.
         shutter: what is done with a rolling shutter, see `Options`.
@@ -86,11 +95,12 @@ def reconstruct(
 
     Raises:
         InputError: the source, the camera or a prior cannot be used.
-        ReconstructionError: the shot cannot be reconstructed.
+        ReconstructionError: the shot cannot be reconstructed, or the file or folder holds several shots.
     """
     begin = time.perf_counter()
     _check_choice("lens", lens, get_args(LensFreedom))
     _check_choice("shutter", shutter, get_args(ShutterUse))
+    check_footage(fields, pixel_aspect)
     options = replace(Options.preset_named(preset), lens=lens, shutter=shutter)
     camera = open_camera(camera)
     frames = checked_range(frames) if frames is not None else None
@@ -98,25 +108,30 @@ def reconstruct(
     mask_prior, object_masks = open_masks(masks), open_objects(objects)
     known = read_control(control) if isinstance(control, str | Path) else control
     recording = open_imu(imu) if isinstance(imu, str | Path) else imu
-    _check_control(known, source, frames)
     if unordered is None:
         unordered = isinstance(source, str | Path) and looks_unordered(Path(source), frames)
+    _check_control(known, source, frames, unordered=unordered)
     if unordered and recording is not None:
         raise InputError("an IMU goes with a video; images in any order have no times")
     if unordered and object_masks is not None:
         raise InputError("objects are tracked in a video; images in any order show no motion")
+    if unordered and (fields != "auto" or pixel_aspect is not None):
+        raise InputError("fields and pixel aspect are of a shot; images in any order take their pixels as square")
+    footage = partial(read_frames, source, frames, fields=fields, pixel_aspect=pixel_aspect)
     if unordered:
         result = _from_images(source, frames, camera, prior, mask_prior, options, known, features, work, progress)
     else:
-        result = _from_shot(
-            source, frames, camera, prior, mask_prior, object_masks, options, known, recording, progress
-        )
+        solve = partial(
+            _solve, source=source, camera=camera, depth=prior, masks=mask_prior, objects=object_masks, options=options,
+            control=known, imu=recording, progress=progress,
+        )  # fmt: skip
+        result = _from_shot(source, footage, solve)
     said = {
         "source": str(source) if isinstance(source, str | Path) else "frames",
         "unordered": unordered,
         "features": str(features),
         "objects": getattr(object_masks, "name", type(object_masks).__name__) if object_masks is not None else None,
-        **input_options(prior, mask_prior, frames),
+        **input_options(source, prior, mask_prior, frames, fields, pixel_aspect),
     }
     for part in (result, *result.others):
         part.seconds["total"] = time.perf_counter() - begin
@@ -129,26 +144,73 @@ def _check_choice(name: str, value: str, expected: tuple[str, ...]) -> None:
         raise InputError(f"unknown {name} '{value}', expected one of {', '.join(expected)}")
 
 
-def _check_control(control: Control | None, source: object, frames: slice | None) -> None:
+def _check_control(control: Control | None, source: object, frames: slice | None, *, unordered: bool) -> None:
     """Before the long work: a folder has all frames that the control names."""
     if control is not None and isinstance(source, str | Path) and Path(source).is_dir():
-        names = [(index, path.name) for index, path in enumerate(list_images(Path(source)))]
-        find_frames(control, names[frames or slice(None)])
+        if unordered:
+            names = [(index, path.name) for index, path in enumerate(list_images(Path(source)))][frames or slice(None)]
+        else:
+            images = chosen(numbered_images(Path(source)), frames or checked_range(slice(None)))
+            names = [(number, path.name) for number, path in images]
+        find_frames(control, names)
 
 
-def input_options(depth: DepthPrior | None, masks: MaskPrior | None, frames: slice | None) -> dict[str, Any]:
-    """What is written beside the options of a result: the names of its priors, and its range."""
+def input_options(
+    source: object,
+    depth: DepthPrior | None,
+    masks: MaskPrior | None,
+    frames: slice | None,
+    fields: Fields = "auto",
+    pixel_aspect: float | None = None,
+) -> dict[str, Any]:
+    """What is written beside the options of a result.
+
+    The number that a sequence begins with, the names of the priors, the range, and how footage was read.
+    """
     return {
+        "first_number": numbers[0] if (numbers := sequence_of(source)) else None,
         "depth": depth.name if depth is not None else None,
         "depth_kind": str(depth.kind) if depth is not None else None,
         "masks": getattr(masks, "name", type(masks).__name__) if masks is not None else None,
         "frames": range_text(frames) if frames is not None else None,
+        "fields": fields,
+        "pixel_aspect": pixel_aspect,
     }
 
 
 def _from_shot(
     source: str | Path | Iterable[Frame | NDArray[np.uint8]],
-    frames: slice | None,
+    footage: Callable[[], Iterator[Frame]],
+    solve: Callable[[Iterator[Frame], Sequence[LeftOut]], Reconstruction],
+) -> Reconstruction:
+    """The one shot of a source; of a file or folder without the slates and bars beside it.
+
+    Args:
+        footage: opens the source; a file or folder is read anew where it holds more than one view.
+
+    Raises:
+        ReconstructionError: there are several shots, or as in `Stream.finish`.
+    """
+    if not isinstance(source, str | Path):
+        return solve(footage(), ())
+    try:
+        result = solve(until_another_view(footage()), ())
+    except AnotherView:
+        edit = read_edit(footage())
+        if len(edit.starts) > 1:
+            raise ReconstructionError(edit.cuts) from None
+        result = solve(footage(), edit.left_out)
+        result.notes[:0] = [f"{part.said[0].upper()}{part.said[1:]}: left out." for part in edit.left_out]
+    if sequence_of(source) and (gaps := missing_numbers([frame.index for frame in result.frames])):
+        result.notes.append(f"The numbering of the frames has gaps: {gaps} are missing.")
+    return result
+
+
+def _solve(
+    images: Iterator[Frame],
+    left_out: Sequence[LeftOut],
+    *,
+    source: object,
     camera: pycolmap.Camera | None,
     depth: DepthPrior | None,
     masks: MaskPrior | None,
@@ -164,9 +226,13 @@ def _from_shot(
             shared = remembered = RememberedDepth(depth) if depth is not None else None
             seen = observed = held.enter_context(ObservedObjects(objects, masks, remembered, options.tracker))
         stream = held.enter_context(Stream(camera, depth=shared, masks=seen, options=options, control=control, imu=imu))
-        for done, frame in enumerate(read_frames(source, frames)):
+        beside: list[FrameResult] = []
+        for done, frame in enumerate(images):
             if progress is not None:
                 progress("frames", done, None)
+            if reason := left_out_of(left_out, frame.index):
+                beside.append(FrameResult(frame.index, frame.name, frame.timestamp, FrameStatus.LEFT_OUT, reason))
+                continue
             stream.push(frame)
             if observed is not None:
                 with stream.seconds.of("objects"):
@@ -181,6 +247,8 @@ def _from_shot(
             with stream.seconds.of("objects"), OneThreadEach():
                 add_objects(result, observed, options)
             result.seconds["objects"] = stream.seconds["objects"]
+        if beside:
+            add_left_out(result, beside)
         return result
 
 

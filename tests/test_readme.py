@@ -20,6 +20,7 @@ from onnx import helper
 from factorsfm import PRESETS, DepthKind, FrameStatus, ShotKind, open_imu, read_camera, read_control, reconstruct
 from factorsfm.cli import main as cli
 from factorsfm.export import FORMATS
+from factorsfm.frames.writing import write_exr
 from factorsfm.priors import models
 from factorsfm.synthetic import RenderedShot, render_moving, render_shot, write_moving, write_shot
 from tests.instruments import CHECKS, WALK_FRAMES, write_measurements, write_walk
@@ -81,13 +82,15 @@ def material(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shot = shot_of_the_examples()
     write_shot(shot, folder)
     write_moving(render_moving("truck", FRAMES, 256, 144, size=0.8), folder / "crossing")
-    for name in ("images", "masks", "networks", "stills"):
+    for name in ("images", "masks", "networks", "stills", "plates", "originals"):
         (folder / name).mkdir()
     mask = np.zeros((90, 160), np.uint8)
     mask[60:, :30] = 255
     for index, image in enumerate(shot.images):
         cv2.imwrite(str(folder / "images" / f"{index}.png"), image)
         cv2.imwrite(str(folder / "masks" / f"{index:06d}.png"), mask)
+        write_exr(folder / "plates" / f"plate.{1001 + index}.exr", np.float16((image[..., ::-1] / 255) ** 2.2))
+        cv2.imwrite(str(folder / "originals" / f"plate.{1001 + index}.png"), cv2.resize(image, (512, 288)))
     for index, image in enumerate(render_shot("arc", frames=3, width=256, height=144, parallax=0.1).images[1:]):
         cv2.imwrite(str(folder / "stills" / f"still_{index}.png"), image)
     (control,) = (block.text for block in blocks(DOCS / "control.md") if block.language == "json")
@@ -269,7 +272,7 @@ def test_the_formats_are_those_of_the_export() -> None:
         assert row["up axis"] in (chosen.defaults.up_axis.value, "–")
         assert row["scale"] in (f"{chosen.defaults.scale:g}", "–")
         assert row["first frame"] in (str(chosen.defaults.first_frame), "–")
-        assert ("`vfx`" in row["writes"]) == (name in ("usd", "stmap"))
+        assert ("`vfx`" in row["writes"]) == (name == "usd")
         assert ("`alembic`" in row["writes"]) == (name == "alembic")
 
 

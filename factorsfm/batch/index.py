@@ -168,10 +168,13 @@ class _EarlierVideo:
     video: str
     size: int
     modified_ns: int
+    fields: str
     shots: list[list[int]]
 
     def key(self) -> str:
-        return json_text({"video": self.video, "size": self.size, "modified_ns": self.modified_ns})
+        return json_text(
+            {"video": self.video, "size": self.size, "modified_ns": self.modified_ns, "fields": self.fields}
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,6 +14,7 @@ import pycolmap
 from factorsfm.batch.outcome import is_result_of
 from factorsfm.camera.files import camera_to_json
 from factorsfm.frames.cuts import find_shots
+from factorsfm.frames.fields import Fields
 from factorsfm.frames.folders import list_files
 from factorsfm.frames.video import VIDEO_SUFFIXES
 from factorsfm.priors.masks import MaskFolder
@@ -35,6 +36,7 @@ class Method:
     preset: str = "default"
     lens: LensFreedom = "auto"
     shutter: ShutterUse = "auto"
+    pixel_aspect: float | None = None
 
     def of_video(self, name: str) -> Method:
         """For one of several videos: with the folders of its maps and masks."""
@@ -58,6 +60,7 @@ class Method:
             "preset": self.preset,
             "lens": self.lens,
             "shutter": self.shutter,
+            "pixel_aspect": self.pixel_aspect,
         }
 
 
@@ -69,16 +72,23 @@ class Video:
         path: absolute.
         name: of its folder in the output.
         size, modified_ns: of the file; a later run takes a file with other values for a new video.
+        fields: as in `read_frames`: what is a frame of it.
     """
 
     path: Path
     name: str
     size: int
     modified_ns: int
+    fields: Fields = "auto"
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data."""
-        return {"video": str(self.path), "size": self.size, "modified_ns": self.modified_ns}
+        return {
+            "video": str(self.path),
+            "size": self.size,
+            "modified_ns": self.modified_ns,
+            "fields": self.fields,
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +117,7 @@ class Job:
         return is_result_of(self.to_dict(), self.folder)
 
 
-def find_videos(source: Path) -> list[Video]:
+def find_videos(source: Path, fields: Fields = "auto") -> list[Video]:
     """The video file, or the video files of a folder in natural order.
 
     Raises:
@@ -126,7 +136,7 @@ def find_videos(source: Path) -> list[Video]:
     for path in paths:
         status = path.stat()
         name = path.stem if stems[path.stem.lower()] == 1 else path.name
-        videos.append(Video(path.resolve(), name, status.st_size, status.st_mtime_ns))
+        videos.append(Video(path.resolve(), name, status.st_size, status.st_mtime_ns, fields))
     return videos
 
 
@@ -136,7 +146,7 @@ def shots_of(video: Video) -> list[range]:
     Raises:
         InputError: the video cannot be read, or all of its frames are blank.
     """
-    shots = find_shots(video.path)
+    shots = find_shots(video.path, fields=video.fields)
     if not shots:
         raise InputError(f"{video.path} holds no shot: all of its frames are blank")
     return shots

@@ -44,6 +44,8 @@ def reconstruct_shot(job: Job, *, one_thread: bool, progress: Progress | None = 
                 preset=method.preset,
                 lens=method.lens,
                 shutter=method.shutter,
+                fields=job.video.fields,
+                pixel_aspect=method.pixel_aspect,
                 progress=progress,
             )
     except FactorsfmError as error:

@@ -19,6 +19,16 @@ from factorsfm.support.json_reading import read_json
 # A 2,000 mm lens on Super 35 film has a ratio of 80.
 _FOCAL_RATIOS = (0.05, 200.0)
 
+_SAME_ASPECT = 0.01  # relative: a calibrated pixel aspect is not exactly the nominal one
+# Models with one focal length: those of the same lenses with two, and how many of their last parameters are 0 then.
+_TWO_FOCAL_LENGTHS = {
+    "SIMPLE_PINHOLE": ("PINHOLE", 0),
+    "SIMPLE_RADIAL": ("OPENCV", 3),
+    "RADIAL": ("OPENCV", 2),
+    "SIMPLE_RADIAL_FISHEYE": ("OPENCV_FISHEYE", 3),
+    "RADIAL_FISHEYE": ("OPENCV_FISHEYE", 2),
+}
+
 
 def read_camera(path: str | Path) -> pycolmap.Camera:
     """Read a camera from a JSON file.
@@ -77,6 +87,37 @@ def check_camera(camera: pycolmap.Camera, width: int, height: int) -> None:
         raise InputError(
             f"the camera is made for {camera.width}x{camera.height} pixels, but the images have {width}x{height}"
         )
+
+
+def fitted_camera(camera: pycolmap.Camera, width: int, height: int, pixel_aspect: float) -> pycolmap.Camera:
+    """The camera for images of this size, in pixels.
+
+    A camera of another size is scaled where its picture has the same aspect as the images and their pixels are not
+    square: it is that of the picture without the squeeze, or of whole frames whose fields were taken apart.
+
+    Args:
+        pixel_aspect: width of a pixel of the images over its height.
+
+    Raises:
+        InputError: it has another size.
+    """
+    if (camera.width, camera.height) == (width, height):
+        return camera
+    shown = camera.width * camera.focal_length_y / camera.focal_length_x / camera.height
+    if pixel_aspect == 1.0 or abs(shown * height / (width * pixel_aspect) - 1.0) > _SAME_ASPECT:
+        check_camera(camera, width, height)
+    scaled = _with_two_focal_lengths(camera)
+    scaled.rescale(width, height)
+    return scaled
+
+
+def _with_two_focal_lengths(camera: pycolmap.Camera) -> pycolmap.Camera:
+    """The same lens in a model whose pixels need not be square."""
+    scaled = pycolmap.Camera(camera.todict())
+    if camera.model_name in _TWO_FOCAL_LENGTHS:
+        scaled.model, zeros = _TWO_FOCAL_LENGTHS[camera.model_name]
+        scaled.params = [camera.params[0], *camera.params, *(0.0,) * zeros]
+    return scaled
 
 
 def camera_from_json(content: Mapping[str, Any]) -> pycolmap.Camera:

@@ -19,29 +19,33 @@ _FIELD_OF_VIEW_DEG = 50.0
 _EXIF_RATIOS = (0.2, 30.0)  # focal length over the longer image side; a value outside is an error in the file
 
 
-def guess_camera(width: int, height: int, image_path: Path | None = None) -> pycolmap.Camera:
+def guess_camera(width: int, height: int, image_path: Path | None = None, pixel_aspect: float = 1.0) -> pycolmap.Camera:
     """First guess of an unknown lens: SIMPLE_PINHOLE, principal point in the middle of the image.
+
+    PINHOLE where pixels are not square, with focal lengths whose ratio is their aspect.
 
     Args:
         width, height: size of the images, pixels.
         image_path: an image whose EXIF data may hold the focal length: as 35 mm equivalent, or with the resolution of
             the focal plane, or with a camera whose sensor COLMAP knows.
+        pixel_aspect: width of a pixel over its height.
 
     Returns:
         A camera whose `has_prior_focal_length` is True if the focal length is from EXIF data. Otherwise the longer side
         spans 50 degrees.
     """
-    longer = max(width, height)
+    longer = max(width * pixel_aspect, height)  # in heights of a pixel
     focal_length = _exif_focal_ratio(image_path) * longer if image_path is not None else 0.0
     known = focal_length > 0
     if not known:
         focal_length = longer / 2 / math.tan(math.radians(_FIELD_OF_VIEW_DEG) / 2)
+    focal_lengths = [focal_length] if pixel_aspect == 1.0 else [focal_length / pixel_aspect, focal_length]
     return pycolmap.Camera(
         camera_id=1,
-        model="SIMPLE_PINHOLE",
+        model="SIMPLE_PINHOLE" if pixel_aspect == 1.0 else "PINHOLE",
         width=width,
         height=height,
-        params=[focal_length, width / 2, height / 2],
+        params=[*focal_lengths, width / 2, height / 2],
         has_prior_focal_length=known,
     )
 

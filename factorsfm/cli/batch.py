@@ -14,7 +14,7 @@ from factorsfm.batch.index import Entry, Index, shots_known
 from factorsfm.batch.plan import Job, Method, Video, find_videos, plan_jobs
 from factorsfm.batch.worker import find_shots_of, reconstruct_shot
 from factorsfm.camera.files import open_camera
-from factorsfm.cli.command import Command, add_method, add_objects, add_output, count_of
+from factorsfm.cli.command import Command, add_footage, add_method, add_objects, add_output, count_of
 from factorsfm.cli.progress_line import ProgressLine
 from factorsfm.priors.depth import open_depth
 from factorsfm.priors.masks import open_masks
@@ -35,6 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("source", metavar="SOURCE", help="a video file, or a folder of video files")
     add_output(parser, "folder of the results: new, empty, or that of an earlier run, which goes on")
     add_method(parser)
+    add_footage(parser)
     add_objects(parser)
     parser.add_argument(
         "--workers",
@@ -53,7 +54,7 @@ def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
     if arguments.workers and arguments.scheduler:
         raise InputError("--workers and --scheduler cannot be combined: a cluster has its own workers")
     source, output = Path(arguments.source), arguments.output
-    videos = find_videos(source)
+    videos = find_videos(source, arguments.fields)
     known = shots_known(output, source)
     method = _method(arguments, several=source.is_dir())
     most, scheduler = arguments.workers or len(available_cores()), arguments.scheduler
@@ -97,8 +98,9 @@ def _method(arguments: argparse.Namespace, *, several: bool) -> Method:
         open_objects(objects)
     camera = open_camera(arguments.camera)
     return Method(
-        camera, depth, arguments.depth_kind, masks, objects, arguments.preset, arguments.lens, arguments.shutter
-    )
+        camera, depth, arguments.depth_kind, masks, objects, arguments.preset, arguments.lens, arguments.shutter,
+        arguments.pixel_aspect,
+    )  # fmt: skip
 
 
 def _absolute(text: str | None) -> str | None:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from factorsfm.cli.progress_line import ProgressLine
+from factorsfm.frames.fields import Fields
 from factorsfm.frames.ranges import parse_range
 from factorsfm.priors.depth_map import DepthKind
 from factorsfm.report.result_folder import write_folder
@@ -99,7 +100,28 @@ def add_objects(parser: argparse.ArgumentParser) -> None:
 
 def add_range(parser: argparse.ArgumentParser) -> None:
     """Declare the range of frames."""
-    parser.add_argument("--frames", metavar="START:STOP[:STEP]", help="counted from 0, without STOP")
+    parser.add_argument(
+        "--frames",
+        metavar="START:STOP[:STEP]",
+        help="counted from 0, or by the numbers in the file names of a sequence; without STOP",
+    )
+
+
+def add_footage(parser: argparse.ArgumentParser) -> None:
+    """Declare how video is read."""
+    parser.add_argument(
+        "--fields",
+        choices=get_args(Fields),
+        default="auto",
+        help="interlaced video. auto: its fields are taken apart into twice the frames of half the lines; apart: those "
+        "of any video; blend: frames stay whole, their fields blended",
+    )
+    parser.add_argument(
+        "--pixel-aspect",
+        type=float,
+        metavar="RATIO",
+        help="width of a pixel over its height, 2 for anamorphic lenses (default: as the file says, else 1)",
+    )
 
 
 def range_of(arguments: argparse.Namespace) -> slice | None:

@@ -10,6 +10,7 @@ from factorsfm.cli.command import Command
 from factorsfm.cli.progress_line import ProgressLine
 from factorsfm.export.formats import FORMATS, export
 from factorsfm.export.options import ExportOptions, UpAxis
+from factorsfm.frames.timing import are_uneven
 from factorsfm.result.reading import read_result
 
 
@@ -22,7 +23,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--fps", type=float, help="frames per second (default: the source's, else 24)")
     parser.add_argument(
-        "--first-frame", type=int, metavar="NUMBER", help="number of the source's first frame (default: the format's)"
+        "--first-frame",
+        type=int,
+        metavar="NUMBER",
+        help="number of the source's first frame (default: that in its file name, else the format's)",
     )
     parser.add_argument(
         "--sensor-width", type=float, default=36.0, metavar="MM", help="of the film back (default: %(default)g)"
@@ -31,7 +35,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--up-axis", choices=[axis.value for axis in UpAxis], help="in the first frame (default: the format's)"
     )
     parser.add_argument("--scale", type=float, help="exported length of one unit (default: the format's)")
-    parser.add_argument("--footage", type=Path, metavar="VIDEO|FOLDER", help="the shot (default: the source)")
+    parser.add_argument(
+        "--footage",
+        type=Path,
+        metavar="VIDEO|FOLDER",
+        help="the shot, of any size with the same aspect ratio (default: the source)",
+    )
 
 
 def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
@@ -42,7 +51,10 @@ def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
     export(reconstruction, arguments.output, format=arguments.format, options=options)
     lost = len(reconstruction.frames) - len(reconstruction.registered)
     without = f"; {lost} of {len(reconstruction.frames)} frames are not registered and have no camera" if lost else ""
-    return f"Wrote {arguments.format} ({FORMATS[arguments.format].description}) to {arguments.output}{without}."
+    times = [frame.timestamp for frame in reconstruction.frames]
+    uneven = arguments.format != "tum" and are_uneven([frame.index for frame in reconstruction.frames], times)
+    rate = "; its frames come at uneven times, and here each lasts as long as any other" if uneven else ""
+    return f"Wrote {arguments.format} ({FORMATS[arguments.format].description}) to {arguments.output}{without}{rate}."
 
 
 def _formats_help() -> str:

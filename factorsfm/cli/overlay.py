@@ -23,14 +23,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--output", type=Path, required=True, metavar="FILE", help=f"the video to write ({', '.join(CODECS)})"
     )
-    parser.add_argument("--source", type=Path, metavar="VIDEO|FOLDER", help="the shot (default: where it was)")
+    parser.add_argument(
+        "--footage",
+        "--source",
+        dest="footage",
+        type=Path,
+        metavar="VIDEO|FOLDER",
+        help="the shot, of any size with the same aspect ratio (default: the source)",
+    )
     parser.add_argument("--hide", nargs="+", choices=LAYERS, default=[], help="what not to draw")
 
 
 def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
     """Write the overlay; see `Command.run`."""
     reconstruction = read_result(arguments.result)
-    props = write_overlay(reconstruction, arguments.output, arguments.source, hide=arguments.hide, progress=progress)
+    props = write_overlay(reconstruction, arguments.output, arguments.footage, hide=arguments.hide, progress=progress)
     plane = _PLANES[props.plane.kind].format(n=len(props.plane.support))
     return f"Wrote {arguments.output}: the grid is on {plane}; a cell is {props.cell:g} wide."
 

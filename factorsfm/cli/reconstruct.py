@@ -10,6 +10,7 @@ from factorsfm import api
 from factorsfm.camera.files import open_camera
 from factorsfm.cli.command import (
     Command,
+    add_footage,
     add_method,
     add_objects,
     add_output,
@@ -31,6 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_method(parser)
     add_objects(parser)
     add_range(parser)
+    add_footage(parser)
     parser.add_argument(
         "--unordered",
         action="store_true",
@@ -77,6 +79,8 @@ def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
             masks=unless_none(arguments.masks),
             objects=unless_none(arguments.objects),
             frames=frames,
+            fields=arguments.fields,
+            pixel_aspect=arguments.pixel_aspect,
             preset=arguments.preset,
             lens=arguments.lens,
             shutter=arguments.shutter,

@@ -11,12 +11,22 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import pycolmap
 
 from factorsfm.api import check_matched, input_options
 from factorsfm.camera.files import camera_to_json, open_camera
-from factorsfm.cli.command import Command, add_method, add_output, add_range, count_of, range_of, unless_none
+from factorsfm.cli.command import (
+    Command,
+    add_footage,
+    add_method,
+    add_output,
+    add_range,
+    count_of,
+    range_of,
+    unless_none,
+)
 from factorsfm.cli.interrupt import first_interrupt
 from factorsfm.cli.progress_line import ProgressLine
 from factorsfm.cli.stream_results import StreamResults
@@ -50,6 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_output(parser)
     add_method(parser)
     add_range(parser)
+    add_footage(parser)
     parser.add_argument(
         "--raw", metavar="WxH:FORMAT", help="size and pixels of raw frames: bgr24, rgb24, gray8, yuv420p or nv12"
     )
@@ -91,7 +102,7 @@ def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
         resumed = held.enter_context(_resumed(arguments, shown)) if arguments.resume else None
         target: Stream | Episode | None = resumed
         with _open_source(arguments, given) as source:
-            results = StreamResults(arguments, source, begin, input_options(given.depth, given.masks, given.frames))
+            results = StreamResults(arguments, source, begin, _said(arguments, given))
             line = _Line(progress.show, source, arguments.cuts)
             with first_interrupt() as interrupt:
                 for frame in interrupt.until(_after(source, resumed, arguments.source)):
@@ -141,10 +152,18 @@ def _open_inputs(arguments: argparse.Namespace) -> _Inputs:
     )
 
 
+def _said(arguments: argparse.Namespace, given: _Inputs) -> dict[str, Any]:
+    return input_options(
+        arguments.source, given.depth, given.masks, given.frames, arguments.fields, arguments.pixel_aspect
+    )
+
+
 def _open_source(arguments: argparse.Namespace, given: _Inputs) -> Source:
     return open_source(
         arguments.source,
         frames=given.frames,
+        fields=arguments.fields,
+        pixel_aspect=arguments.pixel_aspect,
         raw=given.raw,
         watch=arguments.watch,
         end_file=arguments.end_file,

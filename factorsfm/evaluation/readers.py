@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
@@ -19,6 +18,7 @@ from factorsfm.camera.files import read_camera
 from factorsfm.evaluation.plain_pickle import load_plain_pickle
 from factorsfm.evaluation.truth import DepthLookup, DepthMaps, RawDepthMaps, Shot, no_depth
 from factorsfm.frames.folders import list_files, list_images, read_image
+from factorsfm.frames.reading import read_frames
 from factorsfm.frames.video import VIDEO_SUFFIXES
 from factorsfm.support.errors import InputError
 from factorsfm.support.json_reading import read_json
@@ -300,14 +300,8 @@ def _image_size(source: Path, files: Sequence[Path] | None) -> tuple[int, int]:
     if files is not None:
         height, width = read_image(files[0]).shape[:2]
         return width, height
-    capture = cv2.VideoCapture(str(source))
-    try:
-        size = capture.get(cv2.CAP_PROP_FRAME_WIDTH), capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
-    finally:
-        capture.release()
-    if not all(size):
-        raise InputError(f"{source} cannot be read as a video")
-    return int(size[0]), int(size[1])
+    height, width = next(read_frames(source)).image.shape[:2]
+    return width, height
 
 
 def _pinhole(width: int, height: int, fx: float, fy: float, cx: float, cy: float) -> pycolmap.Camera:

@@ -183,11 +183,11 @@ def _footage(shot: Shot) -> dict[str, Any] | None:
         duration = footage.last - footage.first + 1
     else:
         file, source, offset = footage, "MOVIE", 0
-        duration = shot.reconstruction.frames[-1].index + 1
+        duration = shot.reconstruction.frames[-1].index + shot.numbering.shift + 1
     return {
         "file": str(file),
         "source": source,
-        "frame_start": shot.first_frame,
+        "frame_start": shot.footage_start,
         "frame_duration": duration,
         "frame_offset": offset,
     }

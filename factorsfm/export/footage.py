@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import logging
-import re
 from dataclasses import dataclass
 from pathlib import Path
 
 from factorsfm.export.shot import Shot
-from factorsfm.frames.folders import IMAGE_SUFFIXES
+from factorsfm.frames.folders import list_images
+from factorsfm.frames.numbering import missing_numbers
+from factorsfm.frames.sequences import NUMBERED, sequence_numbers
 from factorsfm.support.errors import InputError
 
 logger = logging.getLogger(__name__)
-
-_NUMBERED = re.compile(r"(.*?)(\d+)(\.\w+)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,6 +21,7 @@ class Sequence:
 
     Attributes:
         digits: the numbers are padded with zeros to this length.
+        missing: the numbers in between that have no file, in words; empty without gaps.
     """
 
     folder: Path
@@ -30,6 +30,7 @@ class Sequence:
     suffix: str
     first: int
     last: int
+    missing: str
 
     def file(self, number: int) -> Path:
         return self.folder / f"{self.prefix}{number:0{self.digits}d}{self.suffix}"
@@ -41,7 +42,7 @@ class Sequence:
 
 
 def background(shot: Shot) -> Path | Sequence | None:
-    """The movie file or the sequence of images behind the scene; its first frame is frame 0 of the source.
+    """The movie file or the sequence of images behind the scene.
 
     Raises:
         InputError: the user gave a folder whose images are not a numbered sequence.
@@ -61,20 +62,22 @@ def background(shot: Shot) -> Path | Sequence | None:
 
 
 def image_sequence(folder: Path) -> Sequence:
-    """The numbered images in a folder; other files are ignored.
+    """The numbered images in a folder; other files are ignored, and a warning names gaps in the numbers.
 
     Raises:
-        InputError: there are no images, or their numbers have gaps, which film tools do not accept.
+        InputError: there are no images, or their names differ in more than numbers of one length.
     """
-    names = [path.name for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES]
-    matches = [_NUMBERED.fullmatch(name) for name in names]
-    found = {(match[1], match[3]) for match in matches if match}
-    numbers = sorted((int(match[2]), len(match[2])) for match in matches if match)
+    names = [path.name for path in list_images(folder)]
     if not names:
         raise InputError(f"the footage {folder} holds no images")
-    first, digits = numbers[0] if numbers else (0, 0)
-    without_gaps = [(number, max(digits, len(str(number)))) for number in range(first, first + len(names))]
-    if None in matches or len(found) != 1 or numbers != without_gaps:
-        raise InputError(f"the images in {folder} are not numbered without gaps, as film tools expect it of a sequence")
-    ((prefix, suffix),) = found
-    return Sequence(folder.absolute(), prefix, digits, suffix, first, first + len(names) - 1)
+    numbers = sequence_numbers(names)
+    parts = [match for match in map(NUMBERED.fullmatch, names) if match is not None]
+    if numbers is not None:
+        digits = len(parts[0][2])
+        padded = all(match[2] == f"{number:0{digits}d}" for match, number in zip(parts, numbers, strict=True))
+        if padded and len({match[3] for match in parts}) == 1:
+            missing = missing_numbers(numbers)
+            if missing:
+                logger.warning("the images in %s have gaps: %s are missing", folder, missing)
+            return Sequence(folder.absolute(), parts[0][1], digits, parts[0][3], numbers[0], numbers[-1], missing)
+    raise InputError(f"the images in {folder} are not numbered alike, as film tools expect it of a sequence")

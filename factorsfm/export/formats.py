@@ -70,7 +70,7 @@ FORMATS = {
         "keyframes to paste onto camera and footage",
         write_after_effects,
         is_folder=True,
-        defaults=Defaults(UpAxis.MINUS_Y, scale=100.0, first_frame=0),
+        defaults=Defaults(UpAxis.MINUS_Y, scale=100.0, first_frame=0, numbered=False),
     ),
     "usd": Format("USD stage", write_usd, defaults=Defaults(UpAxis.Y, scale=100.0, first_frame=1001)),
     "alembic": Format("Alembic archive", write_alembic, defaults=Defaults(UpAxis.Y, first_frame=1001)),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import shutil
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,8 @@ import pycolmap
 from factorsfm.export.image_names import image_name
 from factorsfm.export.ply import write_ply
 from factorsfm.export.shot import Shot
+from factorsfm.frames.fields import Fields
+from factorsfm.frames.plates import PLATE_SUFFIXES
 from factorsfm.frames.reading import read_frames
 from factorsfm.frames.writing import write_image
 from factorsfm.result.image_sources import image_sources
@@ -46,7 +48,7 @@ def write_nerfstudio(shot: Shot, folder: Path) -> None:
         InputError: nerfstudio does not know the lens model, or the footage lacks frames.
     """
     r = shot.reconstruction
-    names = {frame.index: image_name(frame.name) for frame in r.registered}
+    names = {frame.index: _trained_name(frame.name) for frame in r.registered}
     lenses = [_lens(r.camera_of(frame)) for frame in r.registered]
     models = {lens.pop("camera_model") for lens in lenses}
     if len(models) > 1:
@@ -69,11 +71,19 @@ def write_nerfstudio(shot: Shot, folder: Path) -> None:
         logger.warning("there is no footage: put the frames into images/ under the names of transforms.json")
         return
     for source in image_sources(shot.footage, r.options):
-        here = {index - source.first: name for index, name in names.items() if source.holds(index)}
+        shift = shot.numbering.shift if source.path == shot.footage else -source.first
+        here = {index + shift: name for index, name in names.items() if source.holds(index)}
         if source.path is None and here:
             logger.warning("there are no files of %s: put these images into images/", ", ".join(here.values()))
         elif source.path is not None and here:
-            _write_images(source.path, here, folder / "images")
+            _write_images(source.path, here, folder / "images", shot.fields)
+
+
+def _trained_name(name: str) -> str:
+    """The name of the image for training, which is 8-bit PNG where nerfstudio cannot read the file itself."""
+    return (
+        str(PurePath(name).with_suffix(".png")) if PurePath(name).suffix.lower() in PLATE_SUFFIXES else image_name(name)
+    )
 
 
 def _lens(camera: pycolmap.Camera) -> dict[str, Any]:
@@ -94,11 +104,11 @@ def _lens(camera: pycolmap.Camera) -> dict[str, Any]:
     }
 
 
-def _write_images(footage: Path, names: dict[int, str], folder: Path) -> None:
+def _write_images(footage: Path, names: dict[int, str], folder: Path, fields: Fields) -> None:
     """Copy image files, and write the frames of a video as images without loss.
 
     Args:
-        names: of the images, by index in the footage.
+        names: of the images, by index in the footage; fields: as in `read_frames`.
     """
     for name in names.values():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -108,10 +118,10 @@ def _write_images(footage: Path, names: dict[int, str], folder: Path) -> None:
     if not missing:
         return
     indices = sorted(missing)
-    for frame in read_frames(footage, slice(indices[0], indices[-1] + 1)):
+    for frame in read_frames(footage, slice(indices[0], indices[-1] + 1), fields=fields):
         if frame.index not in missing:
             continue
         missing.remove(frame.index)
         write_image(folder / names[frame.index], frame.image)
     if missing:
-        raise InputError(f"the footage {footage} lacks frame {min(missing)}, counted from 0")
+        raise InputError(f"the footage {footage} lacks frame {min(missing)}")

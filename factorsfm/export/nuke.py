@@ -50,9 +50,6 @@ def write_nuke(shot: Shot, folder: Path) -> None:
     STMaps. The principal point is in the camera's window translation, the ratio of the focal lengths in its window
     scale (the format's pixels are square). An object is an axis that moves its points. Unregistered frames have no
     key; a note lists them.
-
-    Raises:
-        InputError: the package that writes the STMaps is missing.
     """
     (folder / POINTS).write_text(_tetrahedra(shot.reconstruction.points, shot.point_size), encoding="ascii")
     for thing in shot.objects:
@@ -115,7 +112,7 @@ def _plate(shot: Shot, footage: Path | Sequence | None) -> str:
     if isinstance(footage, Sequence):
         file, first, last = footage.pattern, footage.first, footage.last
     else:
-        file, first, last = footage.as_posix(), 1, shot.reconstruction.frames[-1].index + 1
+        file, first, last = footage.as_posix(), 1, shot.reconstruction.frames[-1].index + shot.numbering.shift + 1
     return _node(
         "Read",
         inputs=0,
@@ -126,7 +123,8 @@ def _plate(shot: Shot, footage: Path | Sequence | None) -> str:
         origlast=last,
         origset="true",
         frame_mode='"start at"',
-        frame=shot.first_frame,
+        frame=shot.footage_start,
+        **({"on_error": "black"} if isinstance(footage, Sequence) and footage.missing else {}),
         name="Plate",
     )
 

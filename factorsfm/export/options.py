@@ -31,13 +31,16 @@ class ExportOptions:
 
     Attributes:
         fps: frames per second; None takes the frame rate from the timestamps of the source, or 24 without them.
-        first_frame: number of the source's frame 0 in the timeline of the target, even if the reconstruction does not
-            include that frame. So the numbers match the footage.
+        first_frame: number of the source's first frame in the timeline of the target, even if the reconstruction does
+            not include that frame. None keeps the numbers of the files of a numbered sequence: `plate.1043.exr` is
+            frame 1043.
         sensor_width: width of the film back in mm. It sets the focal length in mm and does not change the picture.
         up_axis: axis that points up in the first frame.
         scale: length of one world unit of the reconstruction in the exported file.
         footage: the shot, a video file or a folder of images; None takes the source of the reconstruction, if it still
-            exists.
+            exists. It may have another size than what was solved, such as the originals of proxies, with the same
+            aspect ratio: the lens is scaled. A sequence that has all numbers of a numbered source goes with it by the
+            numbers, every other footage frame by frame from the first one on.
 
     Raises:
         InputError: a value is out of range, or the footage does not exist.

@@ -18,6 +18,9 @@ from numpy.typing import NDArray
 
 from factorsfm.export.moving import MovingNull, moving_nulls, object_in_world
 from factorsfm.export.options import ExportOptions, UpAxis
+from factorsfm.export.other_footage import Numbering, at_size_of, match_numbers
+from factorsfm.frames.fields import Fields
+from factorsfm.result.image_sources import fields_of
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.support.errors import InputError
 
@@ -35,11 +38,18 @@ _FRAME_RATES = (24000 / 1001, 24.0, 25.0, 30000 / 1001, 30.0, 48.0, 50.0, 60000 
 
 @dataclass(frozen=True, slots=True)
 class Defaults:
-    """Default values of a format."""
+    """Default values of a format.
+
+    Attributes:
+        first_frame: see `ExportOptions`.
+        numbered: whether frames have the numbers of their files, where these are a numbered sequence; `first_frame`
+            is for all other sources then.
+    """
 
     up_axis: UpAxis = UpAxis.MINUS_Y
     scale: float = 1.0
     first_frame: int = 0
+    numbered: bool = True
 
 
 @dataclass(frozen=True)
@@ -95,7 +105,8 @@ class Shot:
     Attributes:
         reconstruction: rotated and scaled to the exported world, without covariances and prior fits.
         fps: frames per second.
-        first_frame: number of frame 0 of the source.
+        first_frame: number of frame 0 of the source, be there one or not: what is added to the index of a frame.
+        numbering: which frame of the footage is which.
         sensor_width: mm.
         world: (3, 3) rotation from the world of the reconstruction to the exported world.
         scale: exported length of one world unit.
@@ -107,6 +118,7 @@ class Shot:
     reconstruction: Reconstruction
     fps: float
     first_frame: int
+    numbering: Numbering
     sensor_width: float
     world: NDArray[np.float64]
     scale: float
@@ -122,6 +134,11 @@ class Shot:
     @property
     def last(self) -> int:
         return self.first_frame + self.reconstruction.frames[-1].index
+
+    @property
+    def footage_start(self) -> int:
+        """Number of the first frame of the footage."""
+        return self.first_frame + self.numbering.footage_first - self.numbering.shift
 
     @cached_property
     def numbers(self) -> list[int]:
@@ -161,6 +178,11 @@ class Shot:
     def lenses(self) -> list[Lens]:
         """The lens of each registered frame."""
         return [self._pinhole(self.reconstruction.camera_of(frame)) for frame in self.reconstruction.registered]
+
+    @property
+    def fields(self) -> Fields:
+        """How the frames of the footage are read: as those of the result were."""
+        return fields_of(self.reconstruction.options)
 
     @property
     def zooms(self) -> bool:
@@ -207,25 +229,39 @@ def linear_colors(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 def make_shot(reconstruction: Reconstruction, options: ExportOptions, defaults: Defaults) -> Shot:
-    """Fill in the defaults of a format, and rotate and scale the world.
+    """Fill in the defaults of a format, rotate and scale the world, and scale the lens to the size of given footage.
 
     Raises:
-        InputError: the scaled scene is not finite.
+        InputError: the scaled scene is not finite, or footage is given whose aspect ratio is another one.
     """
     up_axis = UpAxis(options.up_axis) if options.up_axis is not None else defaults.up_axis
     scale = options.scale if options.scale is not None else defaults.scale
     world = _TURNED_WORLD[up_axis]
+    footage = Path(options.footage) if options.footage is not None else _source(reconstruction)
+    if options.footage is not None:
+        reconstruction = at_size_of(reconstruction, Path(options.footage))
+    numbering = match_numbers(reconstruction, footage)
     return Shot(
         reconstruction=_in_world(reconstruction, world, scale),
         fps=options.fps or _source_fps(reconstruction.frames) or _DEFAULT_FPS,
-        first_frame=options.first_frame if options.first_frame is not None else defaults.first_frame,
+        first_frame=_first_frame(options, defaults, numbering),
+        numbering=numbering,
         sensor_width=options.sensor_width,
         world=world,
         scale=scale,
         up_axis=up_axis,
-        footage=Path(options.footage) if options.footage is not None else _source(reconstruction),
+        footage=footage,
         options=options,
     )
+
+
+def _first_frame(options: ExportOptions, defaults: Defaults, numbering: Numbering) -> int:
+    """What is added to the index of a frame in its source; see `Shot.first_frame`."""
+    if options.first_frame is not None:
+        return options.first_frame - numbering.source_first
+    if defaults.numbered and numbering.timeline is not None:
+        return numbering.timeline
+    return defaults.first_frame + numbering.shift - numbering.footage_first
 
 
 def _in_world(reconstruction: Reconstruction, world: NDArray[np.float64], scale: float) -> Reconstruction:

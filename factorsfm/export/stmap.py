@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from factorsfm.camera.projection import PIXEL_CENTER
 from factorsfm.export.shot import Shot
-from factorsfm.export.vfx import failures_as_os_errors, require
+from factorsfm.frames.folders import read_pixels
 from factorsfm.frames.reading import read_frames
-from factorsfm.frames.writing import write_image
+from factorsfm.frames.writing import write_exr, write_image
 from factorsfm.support.errors import InputError
 
 Array = NDArray[np.float64]
@@ -32,20 +32,18 @@ def write_stmaps(shot: Shot, folder: Path) -> None:
     `undistort.exr` undistorts footage, `distort.exr` distorts a render to fit the footage. Both keep size, focal length
     and principal point, so the exported camera fits the undistorted footage. Pixels without a counterpart hold -1. A
     zoom has a pair for each registered frame, with the number of the frame: ``undistort.1001.exr``.
-
-    Raises:
-        InputError: the package that writes EXR files is missing.
     """
     for suffix, camera in _cameras(shot):
-        _write_exr(folder / f"{UNDISTORT}{suffix}.exr", _stmap(_distorted_places(camera), camera))
-        _write_exr(folder / f"{DISTORT}{suffix}.exr", _stmap(_undistorted_places(camera), camera))
+        write_exr(folder / f"{UNDISTORT}{suffix}.exr", _stmap(_distorted_places(camera), camera))
+        write_exr(folder / f"{DISTORT}{suffix}.exr", _stmap(_undistorted_places(camera), camera))
 
 
 def write_undistorted(shot: Shot, folder: Path) -> None:
-    """Write every frame of the footage undistorted, as ``plate.NUMBER.png``: 8 bits per channel, cubic interpolation.
+    """Write every frame of the footage undistorted, with cubic interpolation, as ``plate.NUMBER.png`` or ``.exr``.
 
-    Unregistered frames and frames outside of the reconstructed range are included, so that the plates can replace the
-    footage. With a zoom, such a frame uses the lens of the frame before it.
+    Nothing of the plates is lost: images of 8 or 16 bits become PNG of 8 or 16 bits, linear light (EXR) becomes EXR of
+    half or float. Unregistered frames and frames outside of the reconstructed range are included, so that the plates
+    can replace the footage. With a zoom, such a frame uses the lens of the frame before it.
 
     Raises:
         InputError: there is no footage, or its size is not that of the camera.
@@ -55,17 +53,23 @@ def write_undistorted(shot: Shot, folder: Path) -> None:
         raise InputError("there is no footage to undistort; name a video file or a folder of images")
     own = {frame.index: frame.camera for frame in shot.reconstruction.frames if frame.camera is not None}
     x, y = _straightening(camera)
-    for frame in read_frames(shot.footage):
+    for frame in read_frames(shot.footage, fields=shot.fields):
         height, width = frame.image.shape[:2]
         if (width, height) != (camera.width, camera.height):
             raise InputError(
                 f"the footage {shot.footage} has {width}x{height} pixels, the camera {camera.width}x{camera.height}"
             )
-        if frame.index in own:
-            x, y = _straightening(own[frame.index])
-        plate = cv2.remap(frame.image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)
-        name = f"plate.{shot.first_frame + frame.index:04d}.png"
-        write_image(folder / name, np.asarray(plate, np.uint8))
+        index = frame.index - shot.numbering.shift
+        if index in own:
+            x, y = _straightening(own[index])
+        pixels = frame.image if frame.path is None else read_pixels(frame.path)
+        light = pixels.astype(np.float32) if pixels.dtype == np.float16 else pixels  # OpenCV knows no half
+        plate = cv2.remap(light, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT).astype(pixels.dtype)
+        name = f"plate.{shot.first_frame + index:04d}"
+        if plate.dtype.kind == "f":
+            write_exr(folder / f"{name}.exr", plate[..., ::-1])
+        else:
+            write_image(folder / f"{name}.png", plate)
 
 
 def _cameras(shot: Shot) -> list[tuple[str, pycolmap.Camera]]:
@@ -121,10 +125,3 @@ def _stmap(places: Array, camera: pycolmap.Camera) -> NDArray[np.float32]:
     image = np.stack([x, y, np.zeros_like(x)], axis=-1)
     image[outside, :2] = _NOWHERE
     return image.astype(np.float32)
-
-
-def _write_exr(path: Path, image: NDArray[np.float32]) -> None:
-    openexr = require("OpenEXR")
-    header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
-    with failures_as_os_errors(), openexr.File(header, {"RGB": np.ascontiguousarray(image)}) as file:
-        file.write(str(path))

@@ -9,7 +9,7 @@ from typing import Any
 
 from factorsfm.support.errors import InputError
 
-_EXTRA_OF_MODULE = {"OpenEXR": "vfx", "pxr": "vfx", "alembic3d": "alembic", "imath": "alembic"}
+_EXTRA_OF_MODULE = {"pxr": "vfx", "alembic3d": "alembic", "imath": "alembic"}
 
 
 def require(module: str) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 import re
 import threading
 import time
@@ -13,8 +14,11 @@ from urllib.parse import urlsplit
 import cv2
 
 from factorsfm.frames.frame import Frame, bgr_image
-from factorsfm.frames.video import quiet_opencv
+from factorsfm.frames.silence import quiet_opencv
 from factorsfm.support.errors import InputError
+
+# OpenCV's FFmpeg reports broken streams on stderr, past all Python logging. A level that the user has set stays.
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 
 def camera_number(source: object) -> int | None:

@@ -9,17 +9,21 @@ from __future__ import annotations
 
 import statistics
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.frames.block_matching import Thumbnail, dissimilarity, dissolve_variances
+from factorsfm.frames.fields import Fields
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.reading import read_frames
 from factorsfm.support.errors import InputError
+
+T = TypeVar("T")
 
 _BLANK_SHARE = 0.1  # share of the blocks with texture, below which a frame is black, white or flat
 
@@ -229,22 +233,33 @@ class CutDetector:
         return ShotUpdate(index, self._shot.number, True, difference, reason)
 
 
-def find_shots(source: str | Path | Iterable[Frame | NDArray[np.uint8]], frames: slice | None = None) -> list[range]:
+def find_shots(
+    source: str | Path | Iterable[Frame | NDArray[np.uint8]], frames: slice | None = None, *, fields: Fields = "auto"
+) -> list[range]:
     """The shots of a video, each as the range of its frames; blank frames at either end are left out.
 
     Args:
-        source, frames: as in `read_frames`; the ranges count frames of the source.
+        source, frames, fields: as in `read_frames`; the ranges count frames of the source.
 
     Raises:
         InputError: the source cannot be read.
     """
+    shots = by_shot(read_frames(source, frames, fields=fields), list[int], lambda shot, frame: shot.append(frame.index))
+    return [range(shot[0], shot[-1] + 1) for shot in shots]
+
+
+def by_shot(frames: Iterable[Frame], new: Callable[[], T], add: Callable[[T, Frame], None]) -> list[T]:
+    """Collect the frames of each shot, without those that belong to none.
+
+    Args:
+        new: makes an empty collection; add: adds a frame to one.
+    """
     detector = CutDetector()
-    ends: dict[int, tuple[int, int]] = {}  # first and last frame, by the number of the shot
-    for frame in read_frames(source, frames):
+    found: dict[int, T] = {}
+    for frame in frames:
         shot = detector.push(frame).shot
         if shot is None:
             continue
-        first = ends[shot][0] if shot in ends else frame.index
-        ends = {number: pair for number, pair in ends.items() if number <= shot}  # later numbers are now void
-        ends[shot] = (first, frame.index)
-    return [range(first, last + 1) for _, (first, last) in sorted(ends.items())]
+        found = {number: part for number, part in found.items() if number <= shot}  # later numbers are now void
+        add(found.setdefault(shot, new()), frame)
+    return [part for _, part in sorted(found.items())]

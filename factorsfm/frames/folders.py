@@ -15,13 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.frames.frame import Frame
-from factorsfm.frames.video import quiet_opencv
+from factorsfm.frames.plates import PLATE_SUFFIXES, Pixels, read_dpx, read_exr
+from factorsfm.frames.sequences import sequence_numbers
+from factorsfm.frames.silence import quiet_opencv
+from factorsfm.frames.tone import eight_bits
 from factorsfm.support.errors import InputError
 from factorsfm.support.json_text import is_text
 
 logger = logging.getLogger(__name__)
 
-IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"})
+IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}) | PLATE_SUFFIXES
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xd9"
 _JPEG_MARKER = re.compile(rb"\xff+([^\x00\xff\xd0-\xd7])", re.DOTALL)  # without stuffed bytes and restart markers
 _PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
@@ -68,7 +71,7 @@ def watch_folder(folder: Path, end_file: str | Path | None, closed: threading.Ev
     taken: set[str] = set()
     last: Path | None = None
     arrivals: dict[Path, _Arrival] = {}
-    index = 0
+    index = -1
     while not closed.is_set():
         complete = end_file is not None and (folder / end_file).exists()  # tested before the folder is listed
         waiting = [path for path in list_images(folder) if path.name not in taken]
@@ -83,9 +86,11 @@ def watch_folder(folder: Path, end_file: str | Path | None, closed: threading.Ev
                 cause = f"it appeared after {last.name}" if late and last is not None else "it is damaged"
                 logger.warning("image %s is left out: %s", path, cause)
                 continue
+            # Alone a name says its number; beside others a stray file might not go on with theirs.
+            numbers = sequence_numbers([path.name] if last is None else [last.name, path.name])
+            index = index + 1 if numbers is None or numbers[-1] <= index else numbers[-1]
             last = path
             yield Frame(index, image, path.name, path=path)
-            index += 1
         else:
             if complete:
                 return
@@ -132,31 +137,43 @@ class _Arrival:
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
-    """An image file as (h, w, 3) uint8 BGR.
+    """An image file as (h, w, 3) uint8 BGR, from more bits through `tone.eight_bits`.
+
+    Raises:
+        InputError: the file is missing, damaged, truncated or not an image.
+    """
+    return eight_bits(read_pixels(path))
+
+
+def read_pixels(path: Path) -> Pixels:
+    """An image file as (h, w, 3) BGR with all of its bits: uint8, uint16, or half or float for linear light.
 
     Raises:
         InputError: the file is missing, damaged, truncated or not an image.
     """
     try:
+        if path.suffix.lower() == ".exr":
+            path.stat()  # says why a file cannot be read
+            return read_exr(path)
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"image {path} cannot be read: {error.strerror}") from error
+    if path.suffix.lower() == ".dpx":
+        return read_dpx(data, path)
     # Checked before decoding: libjpeg would fill the rest with grey, libpng would write to stderr, past all logging.
     if _is_truncated(data):
         raise InputError(f"image {path} is truncated")
     try:
         with quiet_opencv():
-            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
-            other = (
-                cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if image is None and data else None
-            )
+            color = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), color) if data else None
     except cv2.error as error:
         raise InputError(f"image {path} cannot be decoded; it has too many pixels or is damaged") from error
-    if other is not None:
-        raise InputError(f"image {path} has pixels of {other.dtype}; 8 or 16 bits a channel are expected")
     if image is None:
         raise InputError(f"image {path} cannot be decoded; it is damaged, truncated or not an image")
-    return np.asarray(image, dtype=np.uint8)
+    if image.dtype not in (np.uint8, np.uint16, np.float32):
+        raise InputError(f"image {path} has pixels of {image.dtype}; 8 or 16 bits a channel, or float32, are expected")
+    return np.asarray(image)
 
 
 def _is_truncated(data: bytes) -> bool:

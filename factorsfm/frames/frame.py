@@ -1,4 +1,4 @@
-"""A frame: an image and its position in the source."""
+"""A frame: an image and its number in the source."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.frames.tone import eight_bits
 from factorsfm.support.errors import InputError
 from factorsfm.support.file_names import check_name
 
@@ -17,12 +18,15 @@ class Frame:
     """One image of a shot.
 
     Attributes:
-        index: position in the source, from 0, before any range or step is applied.
+        index: number of the frame: that in the file name for a folder with a numbered sequence (1043 of
+            ``plate.1043.exr``), else its position in the source, from 0; no range or step changes it.
         image: (h, w, 3) uint8, BGR.
         name: file name, perhaps with folders before it, or the zero-padded index for videos and iterables.
         timestamp: seconds from the start of the video, None if unknown.
         dropped: number of frames of a live source that were dropped right before this one.
         path: the image file, whose EXIF data may hold the focal length; None if the frame is not from an image file.
+        pixel_aspect: width of a shown pixel over its height, 1 for square ones.
+        is_field: whether it is one field of an interlaced frame, half of its lines.
 
     Raises:
         InputError: the name is a path that leaves its folder.
@@ -34,6 +38,8 @@ class Frame:
     timestamp: float | None = None
     dropped: int = 0
     path: Path | None = None
+    pixel_aspect: float = 1.0
+    is_field: bool = False
 
     def __post_init__(self) -> None:
         check_name(self.name)
@@ -54,7 +60,7 @@ def bgr_image(image: object, index: int) -> NDArray[np.uint8]:
     channels = image.shape[2] if image.ndim == 3 else 1
     if image.ndim not in (2, 3) or channels not in (1, 3, 4) or image.size == 0:
         raise InputError(f"frame {index} has shape {image.shape}; (h, w), (h, w, 3) or (h, w, 4) is expected")
-    depth8 = image if image.dtype == np.uint8 else (image >> 8).astype(np.uint8)
+    depth8 = eight_bits(image)
     if channels == 1:
         return np.repeat(depth8.reshape(*depth8.shape[:2], 1), 3, axis=2)
     return np.ascontiguousarray(depth8[:, :, :3])

@@ -28,11 +28,12 @@ from factorsfm.frames.capture import (
     open_network_stream,
     without_secrets,
 )
+from factorsfm.frames.fields import Fields
 from factorsfm.frames.folders import list_images, watch_folder
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.ranges import checked_range
 from factorsfm.frames.raw import RawFormat, raw_frames
-from factorsfm.frames.reading import read_frames, uniform
+from factorsfm.frames.reading import check_footage, read_frames, uniform, with_aspect
 from factorsfm.frames.unordered import Unusable, read_images
 from factorsfm.support.context import Closing
 from factorsfm.support.errors import FactorsfmError, InputError
@@ -46,6 +47,8 @@ def open_source(
     source: str | Path | int | BinaryIO | Iterable[NDArray[np.uint8] | NDArray[np.uint16] | Frame],
     *,
     frames: slice | None = None,
+    fields: Fields = "auto",
+    pixel_aspect: float | None = None,
     raw: RawFormat | None = None,
     watch: bool = False,
     end_file: str | Path | None = None,
@@ -60,6 +63,7 @@ def open_source(
             are left out; a camera (its number, or "camera:0"); the URL of a network stream (anything with "://"); raw
             frames from standard input ("-") or a binary file object.
         frames: the range to read; frames keep their index in the source.
+        fields, pixel_aspect: of a video file, as in `read_frames`; the pixel aspect of other sources, too.
         raw: size and pixel format of raw frames.
         watch: whether to wait for further images in a folder. They are taken in natural order, each once it is
             complete; one that appears after a later one was taken is left out.
@@ -78,6 +82,7 @@ def open_source(
         raise InputError(f"a raw format was given, but {source} is no stream of raw frames")
     if end_file is not None and not watch:
         raise InputError(f"end file {end_file} has no meaning unless a folder is watched")
+    check_footage(fields, pixel_aspect)
     closed = threading.Event()
     selection = checked_range(frames if frames is not None else slice(None))
     if watch:
@@ -85,9 +90,9 @@ def open_source(
     elif _is_raw(source):
         opened = _open_raw(source, raw, closed)
     else:
-        opened = _open_device(source, stall_seconds, closed) or _open_files(source, selection)
+        opened = _open_device(source, stall_seconds, closed) or _open_files(source, selection, fields)
     chosen = opened.frames if opened.is_selected else _selected(opened.frames, selection)
-    same_size = uniform(chosen, opened.name, selection.start)
+    same_size = uniform(with_aspect(chosen, pixel_aspect), opened.name, selection.start)
     return Source(same_size, opened.name, closed, opened.is_live if drop is None else drop, queue_size, stall_seconds)
 
 
@@ -136,13 +141,13 @@ def _open_raw(source: BinaryIO | Literal["-"], raw: RawFormat | None, closed: th
     return _Opened(name, raw_frames(sys.stdin.buffer if source == "-" else source, raw, name, closed))
 
 
-def _open_files(source: object, selection: slice) -> _Opened:
+def _open_files(source: object, selection: slice, fields: Fields) -> _Opened:
     """A folder of images, a video file or an iterable of images."""
     if isinstance(source, str | Path) and Path(source).is_dir() and list_images(Path(source)):
-        return _Opened(str(source), _readable(read_images(source, selection)), is_selected=True)
+        return _Opened(str(source), _readable(read_images(source, selection, numbered=True)), is_selected=True)
     name = str(source) if isinstance(source, str | Path) else "the sequence of images"
     files = cast("str | Path | Iterable[NDArray[np.uint8] | NDArray[np.uint16] | Frame]", source)
-    return _Opened(name, read_frames(files, selection), is_selected=True)
+    return _Opened(name, read_frames(files, selection, fields=fields), is_selected=True)
 
 
 def _is_raw(source: object) -> TypeGuard[BinaryIO | Literal["-"]]:

@@ -3,54 +3,63 @@
 from __future__ import annotations
 
 import itertools
-import os
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.frames.folders import IMAGE_SUFFIXES, list_images, read_image
+from factorsfm.frames.fields import Fields
+from factorsfm.frames.folders import IMAGE_SUFFIXES, read_image
 from factorsfm.frames.frame import Frame, bgr_image
+from factorsfm.frames.numbering import chosen, numbered_images
 from factorsfm.frames.ranges import checked_range
-from factorsfm.frames.video import decode, has_timestamps
+from factorsfm.frames.video import decode, open_video
 from factorsfm.support.errors import InputError
 
-# FFmpeg reports broken files on stderr, past all Python logging. A level that the user has set stays.
-os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+_ASPECTS = (0.25, 4.0)  # of pixels: anamorphic lenses squeeze by 2 at most, and fields halve the lines
 
 
 def read_frames(
-    source: str | Path | Iterable[NDArray[np.uint8] | NDArray[np.uint16] | Frame], frames: slice | None = None
+    source: str | Path | Iterable[NDArray[np.uint8] | NDArray[np.uint16] | Frame],
+    frames: slice | None = None,
+    *,
+    fields: Fields = "auto",
+    pixel_aspect: float | None = None,
 ) -> Iterator[Frame]:
     """Read the frames of a shot one by one, in bounded memory.
 
-    Grey, 16-bit and alpha images become 8-bit BGR; the EXIF orientation is applied.
+    Grey, 16-bit, high dynamic range and alpha images become 8-bit BGR, linear light (EXR, floating-point TIFF) through
+    one tone curve (`tone.tone_curve`); the orientation that EXIF or the container states is applied.
 
     Args:
         source: a video file; a folder of images, in natural order (img2 before img10), whose other files are ignored;
             an iterable of images, (h, w), (h, w, 3) or (h, w, 4), uint8 or uint16; or an iterable of `Frame` objects,
             which keep their index, name and timestamp.
-        frames: the range to read, for example ``slice(0, 100, 2)``; no negative numbers.
+        frames: the range to read, for example ``slice(0, 100, 2)``; no negative numbers. It counts as the frames do
+            (`Frame.index`): ``slice(1001, 1101)`` are the first 100 frames of a sequence that begins at 1001.
+        fields: what is done with interlaced video. "auto" takes its fields apart: twice the frames, half the lines;
+            "apart" does so with any video, "blend" keeps frames whole and blends their fields.
+        pixel_aspect: width of a shown pixel over its height (of whole frames, upright), in place of what the container
+            says.
 
     Raises:
-        InputError: at the call, if the source does not exist, is not a video or holds no images; while iterating, if an
-            image is unreadable or truncated, if a frame has another size than the first one, or if there is no frame.
+        InputError: at the call, if an option has no such value, or if the source does not exist, is not a video or
+            holds no images; while iterating, if an image is unreadable or truncated, if a frame has another size than
+            the first one, or if there is no frame.
     """
     selection = checked_range(frames if frames is not None else slice(None))
+    check_footage(fields, pixel_aspect)
     if isinstance(source, (str, Path)):
         path = Path(source)
         if path.is_dir():
-            images = list_images(path)
-            if not images:
-                suffixes = ", ".join(sorted(suffix[1:] for suffix in IMAGE_SUFFIXES))
-                raise InputError(f"folder {path} holds no images ({suffixes})")
-            found = _folder_frames(images, selection)
+            found = with_aspect(_folder_frames(chosen(numbered_images(path), selection)), pixel_aspect)
         elif path.is_file():
             if path.suffix.lower() in IMAGE_SUFFIXES:
                 raise InputError(f"{path} is a single image; a video file or a folder of images is expected")
-            found = _video_frames(path, selection, timed=has_timestamps(path))
+            found = with_aspect(decode(open_video(path), selection, fields), pixel_aspect)
         else:
             raise InputError(f"{path} does not exist; a video file or a folder of images is expected")
         return uniform(found, str(path), selection.start)
@@ -61,7 +70,21 @@ def read_frames(
             f"frames cannot be read from a {type(source).__name__}; "
             "a video file, a folder of images or an iterable of images is expected"
         )
-    return uniform(_array_frames(source, selection), "the sequence of images", selection.start)
+    return uniform(
+        with_aspect(_array_frames(source, selection), pixel_aspect), "the sequence of images", selection.start
+    )
+
+
+def check_footage(fields: str, pixel_aspect: float | None) -> None:
+    """Refuse what is no way to read footage.
+
+    Raises:
+        InputError: an option has no such value.
+    """
+    if fields not in get_args(Fields):
+        raise InputError(f"unknown fields '{fields}', expected one of {', '.join(get_args(Fields))}")
+    if pixel_aspect is not None and not _ASPECTS[0] <= pixel_aspect <= _ASPECTS[1]:
+        raise InputError(f"the pixel aspect is {pixel_aspect:g}; {_ASPECTS[0]:g} to {_ASPECTS[1]:g} is expected")
 
 
 def uniform(frames: Iterator[Frame], source: str, start: int) -> Iterator[Frame]:
@@ -87,22 +110,26 @@ def uniform(frames: Iterator[Frame], source: str, start: int) -> Iterator[Frame]
         raise InputError(f"{source} holds no frames" + (f" from number {start} on" if start else ""))
 
 
+def with_aspect(frames: Iterator[Frame], pixel_aspect: float | None) -> Iterator[Frame]:
+    """The frames with another pixel aspect, which is that of whole frames; None leaves them as they are."""
+    for frame in frames:
+        if pixel_aspect is None:
+            yield frame
+        else:
+            yield replace(frame, pixel_aspect=pixel_aspect * (0.5 if frame.is_field else 1.0))
+
+
 def _array_frames(
     images: Iterable[NDArray[np.uint8] | NDArray[np.uint16] | Frame], selection: slice
 ) -> Iterator[Frame]:
-    chosen = itertools.islice(enumerate(images), selection.start, selection.stop, selection.step)
-    for index, image in chosen:
+    taken = itertools.islice(enumerate(images), selection.start, selection.stop, selection.step)
+    for index, image in taken:
         if isinstance(image, Frame):
             yield replace(image, image=bgr_image(image.image, index))
         else:
             yield Frame(index, bgr_image(image, index), f"{index:06d}")
 
 
-def _folder_frames(paths: list[Path], selection: slice) -> Iterator[Frame]:
-    for index in range(len(paths))[selection]:
-        yield Frame(index, read_image(paths[index]), paths[index].name, path=paths[index])
-
-
-def _video_frames(path: Path, selection: slice, *, timed: bool) -> Iterator[Frame]:
-    for index, image, timestamp in decode(path, selection, timed=timed):
-        yield Frame(index, bgr_image(image, index), f"{index:06d}", timestamp)
+def _folder_frames(images: list[tuple[int, Path]]) -> Iterator[Frame]:
+    for number, path in images:
+        yield Frame(number, read_image(path), path.name, path=path)

@@ -11,9 +11,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.frames.fields import Fields
 from factorsfm.frames.folders import list_images, read_image
 from factorsfm.frames.frame import Frame, bgr_image
+from factorsfm.frames.numbering import chosen, numbered_images
+from factorsfm.frames.ranges import checked_range
 from factorsfm.frames.reading import read_frames
+from factorsfm.frames.sequences import sequence_numbers
 from factorsfm.frames.texture import BLANK_TEXTURE, image_texture
 from factorsfm.support.errors import InputError
 from factorsfm.support.json_text import as_text
@@ -43,12 +47,18 @@ class Unusable:
 
 
 def read_images(
-    source: str | Path | Iterable[Frame | NDArray[np.uint8]], frames: slice | None = None
+    source: str | Path | Iterable[Frame | NDArray[np.uint8]],
+    frames: slice | None = None,
+    *,
+    numbered: bool = False,
+    fields: Fields = "auto",
 ) -> Iterator[Frame | Unusable]:
     """The images of a set, of any sizes; an image that cannot be read becomes an `Unusable`.
 
     Args:
-        source, frames: as in `read_frames`.
+        source, frames, fields: as in `read_frames`.
+        numbered: whether the images of a folder are the frames of a shot, with the numbers in their names; photographs
+            are counted from 0, since the counters of cameras begin anew.
 
     Raises:
         InputError: the source is missing or holds no images.
@@ -56,14 +66,17 @@ def read_images(
     if isinstance(source, str | Path):
         folder = Path(source)
         if not folder.is_dir():
-            yield from read_frames(source, frames)
+            yield from read_frames(source, frames, fields=fields)
             return
-        paths = list_images(folder)
-        for index in range(len(paths))[frames or slice(None)]:
+        if numbered:
+            images = chosen(numbered_images(folder), checked_range(frames or slice(None)))
+        else:
+            images = list(enumerate(list_images(folder)))[frames or slice(None)]
+        for index, path in images:
             try:
-                yield Frame(index, read_image(paths[index]), paths[index].name, path=paths[index])
+                yield Frame(index, read_image(path), path.name, path=path)
             except InputError as error:
-                yield Unusable(index, paths[index].name, str(error).replace(f"image {paths[index]}", "it"))
+                yield Unusable(index, path.name, str(error).replace(f"image {path}", "it"))
         return
     for index, image in list(enumerate(source))[frames or slice(None)]:
         try:
@@ -93,10 +106,14 @@ def looks_unordered(source: Path, frames: slice | None = None) -> bool:
     """
     if not source.is_dir():
         return False
-    paths = list_images(source)[frames or slice(None)]
-    if len(paths) < 2:
+    images = list_images(source)
+    if sequence_numbers([path.name for path in images]) is not None:
+        images = [path for _, path in chosen(numbered_images(source), checked_range(frames or slice(None)))]
+    else:
+        images = images[frames or slice(None)]
+    if len(images) < 2:
         return False
-    reason = _why_unordered(paths)
+    reason = _why_unordered(images)
     if reason:
         logger.info("%s is taken as an unordered set: %s", source, reason)
     return bool(reason)

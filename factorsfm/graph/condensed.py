@@ -38,7 +38,8 @@ def condensed_factor(
     has another size, is moved there before it is condensed.
 
     Args:
-        frames: `index` of the registered frames that stay, all by default; the other poses are eliminated, too.
+        frames: `index` of the registered frames that stay, none that repeats another; all by default. The other poses
+            are eliminated, too.
 
     Returns:
         The factor, and the poses at which it is linearised.
@@ -46,7 +47,7 @@ def condensed_factor(
     Raises:
         InputError: a frame is not registered, or there is none.
     """
-    registered = [frame.index for frame in reconstruction.frames if frame.cam_from_world is not None]
+    registered = [f.index for f in reconstruction.frames if f.cam_from_world is not None and f.repeats is None]
     wanted = registered if frames is None else sorted({*frames})
     unknown = sorted({*wanted} - {*registered})
     if unknown or not wanted:

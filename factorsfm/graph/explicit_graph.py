@@ -59,6 +59,8 @@ class SolvedFrame(Protocol):
     def cam_from_world(self) -> pycolmap.Rigid3d | None: ...
     @property
     def prior(self) -> AffineFit | None: ...
+    @property
+    def repeats(self) -> int | None: ...
 
 
 class Noise(Protocol):
@@ -107,13 +109,13 @@ class SolvedShot(Protocol):
 def factor_graph(reconstruction: SolvedShot) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
     """The observations of a result as factors, and its poses, points and prior affines as values.
 
-    Variables: the pose ``X(i)`` (`world_from_cam`) of the registered frame with `index` i, the point ``L(j)`` with
-    `track_ids` j, the affine ``A(i)`` of that frame's depth prior (`factors.affine_of_native`), and the constant
-    ``T(0)``; the principal point of the calibration ``K(n)`` is the error that a track keeps for 16 registered frames
-    (`ObservationNoise.track`). Projections are undistorted pixels relative to the principal point, at the focal length
-    of `Reconstruction.camera`, where a camera without a rolling shutter has them (`Reconstruction.rolled`). The first
-    pose is held, the unit of length only by weak priors on the points; where the camera only turns or stands, all
-    positions are that of the first. Control has no factors.
+    Variables: the pose ``X(i)`` (`world_from_cam`) of the registered frame with `index` i (that repeats no other), the
+    point ``L(j)`` with `track_ids` j, the affine ``A(i)`` of that frame's depth prior (`factors.affine_of_native`), and
+    the constant ``T(0)``; the principal point of the calibration ``K(n)`` is the error that a track keeps for 16
+    registered frames (`ObservationNoise.track`). Projections are undistorted pixels relative to the principal point, at
+    the focal length of `Reconstruction.camera`, where a camera without a rolling shutter has them
+    (`Reconstruction.rolled`). The first pose is held, the unit of length only by weak priors on the points; where the
+    camera only turns or stands, all positions are that of the first. Control has no factors.
 
     What was observed weighs what it weighs in the polish, and the values are those of the minimum: Levenberg-Marquardt
     stays within a tenth of the standard deviations of the poses. It stays within four tenths where weak priors of the
@@ -153,7 +155,7 @@ def _add_poses(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, r: Solve
     """The poses with weak priors, at the place of the first where the camera does not move."""
     first, together = None, gtsam.noiseModel.Diagonal.Sigmas(np.repeat([_FREE, HELD], 3))
     for frame in r.frames:
-        if (pose := frame.cam_from_world) is None:
+        if (pose := frame.cam_from_world) is None or frame.repeats is not None:
             continue
         key, value = X(frame.index), pose_from_camera(pose.rotation.matrix(), pose.translation)
         values.insert(key, value)

@@ -20,7 +20,7 @@ from factorsfm.imagesets.joint_adjustment import extended, local_pose
 from factorsfm.imagesets.joint_problem import MatchedImage
 from factorsfm.imagesets.mapper import SetMapper, for_image_sets
 from factorsfm.imagesets.photo_folder import pixel_digest, work_folder, write_once
-from factorsfm.result.image_sources import AddedImages, ImageSource, added_images, image_sources
+from factorsfm.result.image_sources import AddedImages, ImageSource, added_images, fields_of, image_sources
 from factorsfm.result.reading import read_result
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.support.errors import InputError, ReconstructionError
@@ -127,8 +127,8 @@ class _Extension:
             return
         by_name = {frame.name: row for row, frame in wanted.items()}
         by_index = {frame.index - source.first: row for row, frame in wanted.items()}
-        folder = path.is_dir()
-        for image in read_images(path) if folder else read_frames(path, slice(0, max(by_index) + 1)):
+        folder, fields = path.is_dir(), fields_of(self._base.options)
+        for image in read_images(path) if folder else read_frames(path, slice(0, max(by_index) + 1), fields=fields):
             row = by_name.get(image.name) if folder else by_index.get(image.index)
             if row is not None and isinstance(image, Frame):
                 if self._misfit(image):
@@ -147,7 +147,8 @@ class _Extension:
         path = Path(images) if isinstance(images, str | Path) else None
         own = path is not None and main is not None and path.resolve() == Path(str(main)).resolve()
         first = 0 if own else max(used) + 1
-        for image in read_images(images, frames):
+        numbered = own and not self._base.options.get("unordered")
+        for image in read_images(images, frames, numbered=numbered, fields=fields_of(self._base.options)):
             report("new images", len(self._new), None)
             index = first + image.index
             row = row_of.get((index, image.name))

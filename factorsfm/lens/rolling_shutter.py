@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,12 +50,14 @@ class Recording:
 
     Attributes:
         width, height: pixels.
-        times: (n,) of the images, in frames of the source, ascending.
+        times: (n,) of the images, ascending, in usual intervals between two frames of the source.
+        stretch: (2,) focal lengths across and down over their mean, which differ where pixels are not square.
     """
 
     width: int
     height: int
-    times: Index
+    times: Array
+    stretch: Array = field(default_factory=lambda: np.ones(2))
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,12 +104,12 @@ def with_sweep(
         ids = tracks[observations.point[rows]]
         before, here, after = (float(focal[k]) * _seen(images, position + step, ids) for step in (-1, 0, 1))
         velocities = (here - before) / gaps[position], (after - here) / gaps[position + 1]
-        place[rows] = here / (recording.width, recording.height)
+        place[rows] = here * recording.stretch / (recording.width, recording.height)
         motion[rows], acceleration[rows] = _motion(*velocities, gaps[position], gaps[position + 1], place[rows])
     return replace(observations, sweep=Sweep(motion, acceleration, place))
 
 
-def _motion(to: Array, on: Array, time_to: int, time_on: int, place: Array) -> tuple[Array, Array]:
+def _motion(to: Array, on: Array, time_to: float, time_on: float, place: Array) -> tuple[Array, Array]:
     """(n, 2) motion and acceleration in an image, from the velocities before and after it, NaN where there is none.
 
     The acceleration is smooth over the image: that of a single track would contain the error of the very observation

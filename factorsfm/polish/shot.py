@@ -101,6 +101,11 @@ class Shot:
         seen = [by_position.get(position, none) for position in frames]
         return gather(seen, np.arange(points), self._focal(frames))
 
+    def times(self, frames: Sequence[int]) -> Array:
+        """(k,) when some of the images were recorded, in usual intervals between two; their positions if unknown."""
+        times = np.arange(len(self.images)) if self.recording is None else self.recording.times
+        return np.asarray(times[list(frames)], np.float64)
+
     def _focal(self, frames: Sequence[int]) -> Array:
         return self.guess.focal[self.group[list(frames)]]
 

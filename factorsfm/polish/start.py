@@ -119,7 +119,7 @@ def _solved_core(shot: Shot, frames: list[int], observations: Observations, trac
     if shutter is not None:
         adjustment = solution_from(replace(adjustment.state, lens=shutter.lens.shape), few, options.polish)
     if options.estimates_lens:
-        adjustment, lens = _estimate_lens(adjustment, frames, options, shot.first_focal, moves=not found.turns)
+        adjustment, lens = _estimate_lens(adjustment, shot, frames, options, moves=not found.turns)
         shutter = shutter and shutter.known_with(lens)
     if motion is None or lens is not None or shutter is not None:
         motion = _motion(adjustment, found.rest, o)
@@ -167,18 +167,18 @@ def _world(observations: Observations) -> int:
 
 def _estimate_lens(
     adjustment: BundleAdjustment,
+    shot: Shot,
     frames: list[int],
     options: Options,
-    first_focal: tuple[Array, float] | None,
     *,
     moves: bool,
 ) -> tuple[BundleAdjustment, LensEstimate]:
     """As `estimate_lens`, with a focal length for every frame where a zoom is asked for and found."""
     zoom = None
     if options.lens == "zoom" and len(adjustment.state.log_focal) == 1:
-        zoom = find_zoom(adjustment, np.array(frames, np.float64), options.polish)
+        zoom = find_zoom(adjustment, shot.times(frames), options.polish)
     if zoom is None or not zoom.found:
-        adjustment, lens = estimate_lens(adjustment, options, first_focal=first_focal, moves=moves)
+        adjustment, lens = estimate_lens(adjustment, options, first_focal=shot.first_focal, moves=moves)
         return adjustment, replace(lens, zoom_std=zoom.std if zoom else None)
     prior = FocalPrior(np.zeros(len(frames)), zoom.information)
     adjustment, lens = estimate_lens(zoom.adjustment, options, prior)

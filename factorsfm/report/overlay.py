@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from factorsfm.camera.projection import PIXEL_CENTER
 from factorsfm.export.options import ExportOptions
-from factorsfm.export.shot import Defaults, make_shot
+from factorsfm.export.shot import Defaults, Shot, make_shot
 from factorsfm.export.writing import complete_file
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.reading import read_frames
+from factorsfm.frames.video import count_frames
 from factorsfm.report.props import Props, place_props
 from factorsfm.report.wording import status_words
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
@@ -94,7 +95,7 @@ def write_overlay(
     Args:
         path: .mp4, .mov or .avi (JPEG pictures: larger and better). An odd width or height gains a pixel, since the
             codecs need even ones.
-        source: the shot; None takes the source of the reconstruction.
+        source: the shot, as `ExportOptions.footage`; None takes the source of the reconstruction.
         hide: of "grid", "cubes", "points".
         progress: called with the stage, the frames done, and their number.
 
@@ -114,6 +115,7 @@ def write_overlay(
     shot = make_shot(reconstruction, ExportOptions(footage=source), Defaults())
     if shot.footage is None:
         raise InputError("the source of this result is not where it was; say where the shot is")
+    reconstruction = shot.reconstruction  # in its own world, at the size of the footage
     props, projector = place_props(reconstruction), Projector.of(reconstruction)
     camera, frames = reconstruction.camera, reconstruction.frames
     step = np.median(np.diff([frame.index for frame in frames])) if len(frames) > 1 else 1
@@ -124,7 +126,7 @@ def write_overlay(
         if not video.isOpened():
             raise InputError(f"OpenCV cannot write the video {path}")
         try:
-            for position, frame in enumerate(_footage(shot.footage, reconstruction)):
+            for position, frame in enumerate(_footage(shot.footage, shot)):
                 if progress is not None:
                     progress("overlay", position, len(frames))
                 image = draw_overlay(reconstruction, position, frame.image, props, projector, layers)
@@ -132,7 +134,7 @@ def write_overlay(
                 video.write(cv2.copyMakeBorder(image, 0, below, 0, right, cv2.BORDER_REPLICATE))
         finally:
             video.release()
-        if (kept := _count_frames(file)) < len(frames):  # OpenCV says nothing of a full disk
+        if (kept := count_frames(file)) < len(frames):  # OpenCV says nothing of a full disk
             raise OSError(f"only {kept} of {len(frames)} frames are in the file; is the disk full?")
     return props
 
@@ -166,10 +168,11 @@ def draw_overlay(
     return canvas
 
 
-def _footage(source: Path, reconstruction: Reconstruction) -> Iterator[Frame]:
+def _footage(source: Path, shot: Shot) -> Iterator[Frame]:
     """The frames of the reconstruction, in order."""
-    camera, wanted = reconstruction.camera, [frame.index for frame in reconstruction.frames]
-    images = read_frames(source, slice(wanted[0], wanted[-1] + 1))
+    camera = shot.reconstruction.camera
+    wanted = [frame.index + shot.numbering.shift for frame in shot.reconstruction.frames]
+    images = read_frames(source, slice(wanted[0], wanted[-1] + 1), fields=shot.fields)
     for index in wanted:
         found = next((image for image in images if image.index == index), None)
         if found is None:
@@ -180,15 +183,6 @@ def _footage(source: Path, reconstruction: Reconstruction) -> Iterator[Frame]:
                 f"frame {index} of {source} has {width}x{height} pixels, the result {camera.width}x{camera.height}"
             )
         yield found
-
-
-def _count_frames(video: Path) -> int:
-    capture = cv2.VideoCapture(str(video))
-    count = 0
-    while capture.grab():
-        count += 1
-    capture.release()
-    return count
 
 
 def _draw_grid(canvas: Image, lines: Array) -> None:

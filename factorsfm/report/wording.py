@@ -22,6 +22,7 @@ _STATUS = {
     "too_few_inliers": "tracks contradict the scene",
     "blank": "blank or out of focus",
     "waiting": "before the solve could start",
+    "left_out": "not of the shot",
     "unusable": "image cannot be used",
 }
 

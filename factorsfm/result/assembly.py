@@ -43,6 +43,7 @@ def assemble(
     depth_kind: DepthKind | None,
     seconds: dict[str, float],
     options: dict[str, Any],
+    interval: float = 0.0,
 ) -> Reconstruction:
     """The public result.
 
@@ -52,6 +53,7 @@ def assemble(
         camera: with which the polish began.
         lens_given: whether that camera was given; otherwise it is a guess.
         depth_kind: what the depth prior holds; None without a prior.
+        interval: seconds between two frames, 0 if unknown.
     """
     scale = _scale(polished, images, depth_kind)
     unit = scale or 1.0
@@ -87,7 +89,9 @@ def assemble(
     has_depth = any(image.tracks.depth is not None for image in images)
     guessed = camera if polished.lens is None and not lens_given else None
     result.doubts += result_doubts(polished)
-    result.notes += result_notes(polished, result, guessed, depth_given=depth_kind is not None, has_depth=has_depth)
+    result.notes += result_notes(
+        polished, result, guessed, depth_given=depth_kind is not None, has_depth=has_depth, interval=interval
+    )
     if polished.world_alignment is not None:
         _place(result, polished.world_alignment)
     return result

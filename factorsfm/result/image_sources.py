@@ -6,8 +6,9 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
+from factorsfm.frames.fields import Fields
 from factorsfm.support.json_reading import typed
 
 
@@ -67,3 +68,9 @@ def image_sources(main: Path, options: Mapping[str, Any]) -> list[ImageSource]:
     return [
         ImageSource(path, first, stop) for path, first, stop in zip(paths, starts, [*starts[1:], math.inf], strict=True)
     ]
+
+
+def fields_of(options: Mapping[str, Any]) -> Fields:
+    """How the footage of a result with these options was read, see `read_frames`: its frames are counted so."""
+    said = options.get("fields")
+    return next((known for known in get_args(Fields) if known == said), "auto")

@@ -67,13 +67,20 @@ def result_doubts(polished: Polished) -> list[str]:
 
 
 def result_notes(
-    polished: Polished, result: Reconstruction, guessed: pycolmap.Camera | None, *, depth_given: bool, has_depth: bool
+    polished: Polished,
+    result: Reconstruction,
+    guessed: pycolmap.Camera | None,
+    *,
+    depth_given: bool,
+    has_depth: bool,
+    interval: float = 0.0,
 ) -> list[str]:
     """All notes on a result, the most important ones first.
 
     Args:
         guessed: the camera, where it was neither given nor estimated.
         depth_given: whether there is a depth prior; has_depth: whether a frame has a depth map.
+        interval: seconds between two frames, 0 if unknown.
     """
     notes = _motion_notes(polished, has_depth)
     if polished.moving:
@@ -99,7 +106,7 @@ def result_notes(
     if guessed is not None:
         notes.append(_focal_origin_note(guessed))
     if result.shutter is not None:
-        notes.append(shutter_note(result.shutter, [frame.timestamp for frame in result.frames]))
+        notes.append(shutter_note(result.shutter, interval))
     return notes + observability_notes(result.frames)
 
 
@@ -155,16 +162,14 @@ def _focal_origin_note(camera: pycolmap.Camera) -> str:
     )
 
 
-def shutter_note(shutter: RollingShutter, timestamps: Sequence[float | None]) -> str:
+def shutter_note(shutter: RollingShutter, interval: float) -> str:
     """How a rolling shutter reads the images, and which moment the poses belong to.
 
     Args:
-        timestamps: of the frames, seconds.
+        interval: seconds between two frames, 0 if unknown.
     """
     way = ("top", "bottom") if shutter.along == "rows" else ("left", "right")
     first, last = way if shutter.readout > 0 else way[::-1]
-    times = [time for time in timestamps if time is not None]
-    interval = float(np.median(np.diff(times))) if len(times) == len(timestamps) else 0.0
     milliseconds = f" ({1e3 * abs(shutter.readout) * interval:.1f} ms)" if interval > 0 else ""
     poses = "are those of the image's middle"
     if shutter.recorded:

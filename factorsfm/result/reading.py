@@ -45,6 +45,7 @@ class _Status:
     prior: PriorFit | None
     observability: CameraObservability | None
     focal_std: float | None
+    repeats: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,6 +174,7 @@ def _frame(status: _Status, images: Mapping[int, pycolmap.Image], *, own: bool) 
         observability=status.observability,
         camera=_copy(image.camera) if image is not None and own else None,
         focal_std=status.focal_std,
+        repeats=status.repeats,
     )
 
 

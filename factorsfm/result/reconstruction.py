@@ -107,7 +107,7 @@ class FrameResult:
     """One frame of the source.
 
     Attributes:
-        index: position in the source, from 0, before any range or step is applied.
+        index: number of the frame in the source, see `Frame.index`.
         name: file name, perhaps with folders before it, or the zero-padded index.
         timestamp: seconds, None if unknown.
         status, message: whether the frame is registered or why not, and the same in words with numbers.
@@ -127,6 +127,8 @@ class FrameResult:
         thumbnail: a small JPEG of the image, or None.
         camera: the lens of this frame if the frames do not share one, else None; see `Reconstruction.camera_of`.
         focal_std: relative standard deviation of the focal length of this frame, if it has its own estimate.
+        repeats: index of the frame whose image a video shows here once more; this one has its pose and all else of it,
+            but no observations of its own. None for a new image.
     """
 
     index: int
@@ -146,6 +148,7 @@ class FrameResult:
     thumbnail: bytes | None = None
     camera: pycolmap.Camera | None = None
     focal_std: float | None = None
+    repeats: int | None = None
 
     @property
     def registered(self) -> bool:

@@ -173,4 +173,5 @@ def _frame_json(frame: FrameResult) -> dict[str, Any]:
         "observability": frame.observability and asdict(frame.observability),
         "focal_length": frame.camera and frame.camera.mean_focal_length(),
         "focal_std": frame.focal_std,
+        "repeats": frame.repeats,
     }

@@ -21,6 +21,7 @@ from factorsfm.polish.polished import Polished
 from factorsfm.priors.depth import DepthPrior
 from factorsfm.result.assembly import assemble
 from factorsfm.result.reconstruction import Reconstruction
+from factorsfm.streaming.footage import Footage
 from factorsfm.streaming.frame_update import SeenFrame
 from factorsfm.streaming.imu_result import add_imu
 from factorsfm.streaming.imu_source import ImuSource
@@ -39,7 +40,7 @@ class EndedShot:
         colors: (n, 3) RGB by track id.
         camera: the lens of the mapper's images; lens_given: whether it is known, and no guess.
         depth: the prior; without_depth: why it failed, by the frame's index.
-        control: what is known beforehand; imu: beside the stream.
+        control: what is known beforehand; imu: beside the stream; footage: how the frames were recorded.
         seconds: of the stages so far; that of the polish is added.
         suspects: ids of the tracks that count only where they agree with the others.
     """
@@ -53,6 +54,7 @@ class EndedShot:
     without_depth: Mapping[int, str]
     control: Control | None
     imu: ImuSource | None
+    footage: Footage
     options: Options
     seconds: StageSeconds
     suspects: NDArray[np.int64]
@@ -79,6 +81,7 @@ class EndedShot:
             lens_given=self.lens_given,
             depth_kind=None if self.depth is None else self.depth.kind,
             seconds=dict(self.seconds),
+            interval=self.footage.interval(self.frames),
             options=self.options.to_dict(),
         )
         if len(self.suspects):
@@ -119,7 +122,9 @@ class EndedShot:
         shutter = self.options.shutter
         if shutter == "global" or (shutter == "auto" and self.control is not None):
             return None
-        return Recording(self.camera.width, self.camera.height, np.array([frame.index for frame in self.frames]))
+        focal = np.array([self.camera.focal_length_x, self.camera.focal_length_y])
+        size = (self.camera.width, self.camera.height)
+        return Recording(*size, self.footage.times(self.frames), focal / focal.mean())
 
     def _factors(self) -> ShotFactors | None:
         """Those that were added to the live graph, with the poses that these are beside."""

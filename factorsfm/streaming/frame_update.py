@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pycolmap
@@ -60,6 +60,7 @@ class FrameUpdate:
         note: one sentence on what became of the map with this frame, where that is out of the ordinary: a start that
             was given up or begins again without what moves by itself, a depth prior without which the stream goes on;
             else empty.
+        repeats: index of the frame whose image this one shows once more, and whose pose it has; None if it is new.
     """
 
     index: int
@@ -79,6 +80,7 @@ class FrameUpdate:
     focal_changed: bool = False
     starts_anew: bool = False
     note: str = ""
+    repeats: int | None = None
 
 
 def check_size(frame: Frame, size: tuple[int, int] | None) -> None:
@@ -117,6 +119,14 @@ def frame_update(
         image.inliers, mapper.new_points, mapper.parallax, image.covariance, _newest_prior(mapper, frames),
         frame.dropped, focal_length=mapper.focal, focal_changed=focal_changed, starts_anew=mapper.starts_anew,
         note=mapper.note,
+    )  # fmt: skip
+
+
+def repeated_update(frame: Frame, last: FrameUpdate) -> FrameUpdate:
+    """What is known of a frame that shows the image of the last one once more: the same."""
+    return replace(
+        last, index=frame.index, message=f"repeats frame {last.index}: {last.message}", keyframe=False, new_points=0,
+        dropped=frame.dropped, focal_changed=False, starts_anew=False, note="", repeats=last.index,
     )  # fmt: skip
 
 

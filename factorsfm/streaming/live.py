@@ -11,6 +11,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from factorsfm.camera.files import open_camera
+from factorsfm.frames.fields import Fields
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.live_sources import Source, open_source
 from factorsfm.frames.raw import RawFormat
@@ -60,6 +61,8 @@ def track(
     masks: str | Path | MaskPrior | None = None,
     preset: str = "default",
     frames: slice | None = None,
+    fields: Fields = "auto",
+    pixel_aspect: float | None = None,
     raw: RawFormat | None = None,
     watch: bool = False,
     drop: bool | None = None,
@@ -67,7 +70,7 @@ def track(
     """Follow a source: a pose for every frame as it arrives.
 
     Args:
-        source, frames, raw, watch, drop: see `open_source`.
+        source, frames, fields, pixel_aspect, raw, watch, drop: see `open_source`.
         camera, depth, depth_kind, masks, preset: see `reconstruct`.
 
     Example:
@@ -82,5 +85,7 @@ def track(
     options = Options.preset_named(preset)
     prior = open_depth(depth, depth_kind) if options.uses_depth else None
     lens, ignored = open_camera(camera), open_masks(masks)
-    opened = open_source(source, frames=frames, raw=raw, watch=watch, drop=drop)
+    opened = open_source(
+        source, frames=frames, fields=fields, pixel_aspect=pixel_aspect, raw=raw, watch=watch, drop=drop
+    )
     return Live(opened, Stream(lens, depth=prior, masks=ignored, options=options))

@@ -14,8 +14,6 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.camera.files import check_camera
-from factorsfm.camera.guess import guess_camera
 from factorsfm.control.known import Control
 from factorsfm.frames.frame import Frame, as_frame
 from factorsfm.frames.texture import BLANK_TEXTURE
@@ -31,6 +29,7 @@ from factorsfm.priors.read_priors import read_depth, read_mask
 from factorsfm.report.thumbnails import Thumbnails
 from factorsfm.result.reconstruction import Reconstruction
 from factorsfm.streaming.finishing import EndedShot
+from factorsfm.streaming.footage import Footage
 from factorsfm.streaming.frame_update import (
     FrameIndices,
     FrameUpdate,
@@ -113,6 +112,7 @@ class Stream(Closing):
         self._colors = TrackColors()
         self._without_depth: dict[int, str] = {}  # why the prior failed, by the frame's index
         self._indices = FrameIndices()
+        self._footage = Footage()
 
     def push(self, frame: Frame | NDArray[np.uint8], *, keyframe: bool = False) -> FrameUpdate:
         """Take the next frame.
@@ -134,8 +134,10 @@ class Stream(Closing):
         check_size(frame, self._size)
         with self.seconds.of("masks"):
             mask = read_mask(self._suspicion.sure, frame)
+        grey = np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY), np.uint8)
+        if (repeated := self._footage.repeated(frame, grey, len(self.frames))) is not None:
+            return repeated
         with self.seconds.of("tracking"):
-            grey = np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY), np.uint8)
             tracked = self._tracker.track(grey, mask, self._finder.expected(mapper))
         self._colors.remember(frame.image, tracked.ids, tracked.xy)
         with self.seconds.of("mapping"):
@@ -162,7 +164,7 @@ class Stream(Closing):
             self._finder.keep_in_sight(mapper, image, grey)
         if image.status is not FrameStatus.WAITING:  # it may still take part in the start
             mark_blank(mapper, len(self.frames) - 1, tracked.texture)
-        return frame_update(frame, image, mapper, self.frames, focal_changed=focal_changed)
+        return self._footage.told(frame_update(frame, image, mapper, self.frames, focal_changed=focal_changed))
 
     def trajectory(self) -> list[pycolmap.Rigid3d | None]:
         """`cam_from_world` of every frame so far as the graph knows it now, None where it has none.
@@ -172,7 +174,7 @@ class Stream(Closing):
         if self._mapper is None:
             return []
         self._mapper.refresh()
-        return [pose_of(image) for image in self._mapper.images]
+        return self._footage.with_repeats([pose_of(image) for image in self._mapper.images])
 
     def graph(self) -> LiveGraph:
         """A copy of the live factor graph, and its values; both empty before the second keyframe.
@@ -257,6 +259,7 @@ class Stream(Closing):
                 "thumbnails": self._thumbnails.state(),
                 "next_view": self._finder.relocalizer.next_view,
                 "mapper": self._mapper.state() if self._mapper is not None else None,
+                "footage": self._footage.state(),
                 "imu": self._imu.state() if self._imu is not None else None,
                 "suspicion": self._suspicion.state(),
             },
@@ -299,6 +302,7 @@ class Stream(Closing):
         self._finder = ViewFinder(self._tracker, state["views"], state["next_view"])
         self._colors = TrackColors(state["colors"])
         self._thumbnails.restore(state["thumbnails"])
+        self._footage.restore(state["footage"])
         if state["mapper"] is not None:
             self._mapper = self._new_mapper()
             self._mapper.restore(state["mapper"])
@@ -322,8 +326,9 @@ class Stream(Closing):
             except ReconstructionError as error:
                 frames = frame_results(self.frames, self._mapper.images if self._mapper is not None else [])
                 self._thumbnails.attach(frames)
-                raise ReconstructionError(str(error), frames) from error
+                raise ReconstructionError(str(error), self._footage.add_results(frames)) from error
             self._thumbnails.attach(result.frames)
+            self._footage.add_to(result)
             return result
 
     def _ended(self) -> EndedShot:
@@ -340,7 +345,7 @@ class Stream(Closing):
         return EndedShot(
             frames=self.frames, mapper=self._mapper, colors=self._colors.table, camera=self.camera,
             lens_given=self._lens_given, depth=self._depth, without_depth=self._without_depth, control=self.control,
-            imu=self._imu, options=self.options, seconds=self.seconds, suspects=suspects,
+            imu=self._imu, footage=self._footage, options=self.options, seconds=self.seconds, suspects=suspects,
         )  # fmt: skip
 
     def close(self) -> None:
@@ -355,16 +360,14 @@ class Stream(Closing):
     def _open(self, frame: Frame) -> Mapper:
         """Everything that waits for the size of the first frame."""
         check_size(frame, None)
-        height, width = frame.image.shape[:2]
         if self.camera is None:
-            self.camera = guess_camera(width, height, frame.path)
             self.options = self.options.for_unknown_lens()
-        check_camera(self.camera, width, height)
+        self.camera = self._footage.opened(frame, self.camera)
         if self.options.estimates_lens:
             distortion_of(self.camera)  # refuses what cannot be estimated
-        self._size = (width, height)
-        self._mapper = self._new_mapper()
-        return self._mapper
+        self._size = (self.camera.width, self.camera.height)
+        mapper = self._mapper = self._new_mapper()
+        return mapper
 
     def _follow_focal(self, mapper: Mapper) -> bool:
         """Take over the camera of the mapper's images; whether it has another focal length."""

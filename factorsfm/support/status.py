@@ -16,6 +16,7 @@ class FrameStatus(StrEnum):
     LOST = "lost"  # the image shows nothing that is in the map
     BLANK = "blank"  # black, white or blurred: no texture to track
     WAITING = "waiting"  # the map is not yet initialised
+    LEFT_OUT = "left_out"  # not of the shot: a slate, bars, a piece of another shot
     UNUSABLE = "unusable"  # an image of a set that cannot be read
 
 

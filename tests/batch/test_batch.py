@@ -350,7 +350,7 @@ def test_a_worker_for_every_core_but_not_more_than_shots_and_the_longest_shot_fi
     monkeypatch.setattr("factorsfm.cli.batch.open_crew", crew)
     monkeypatch.setattr("factorsfm.cli.batch.available_cores", lambda: list(range(cores)))
     monkeypatch.setattr("factorsfm.cli.batch.reconstruct_shot", shot)
-    monkeypatch.setattr("factorsfm.batch.plan.find_shots", lambda _: [range(2), range(2, 12), range(12, 16)])
+    monkeypatch.setattr("factorsfm.batch.plan.find_shots", lambda _, fields: [range(2), range(2, 12), range(12, 16)])
     assert main(["batch", str(film), "--output", str(tmp_path / "out"), "--depth", "none"]) == 3
     assert opened == [1, workers]  # one video, then three shots
     assert done == [(10, cores < 6), (4, cores < 6), (2, cores < 6)]

@@ -6,7 +6,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from factorsfm.camera.files import camera_to_json, check_camera, open_camera, read_camera
+from factorsfm.camera.files import camera_to_json, check_camera, fitted_camera, open_camera, read_camera
 from factorsfm.camera.guess import guess_camera
 from factorsfm.camera.projection import normalized_from_pixels, pixels_from_normalized
 from factorsfm.support.errors import InputError
@@ -23,6 +23,44 @@ LENSES = {
 def write(path, content):
     path.write_text(content if isinstance(content, str) else json.dumps(content))
     return path
+
+
+@pytest.mark.parametrize(("width", "height", "aspect"), [(320, 360, 2.0), (640, 180, 0.5), (720, 576, 16 / 15)])
+def test_a_guess_for_pixels_that_are_not_square(width, height, aspect):
+    camera = guess_camera(width, height, pixel_aspect=aspect)
+    assert camera.model_name == "PINHOLE"
+    assert camera.focal_length_y / camera.focal_length_x == pytest.approx(aspect)
+    longer = max(width / camera.focal_length_x, height / camera.focal_length_y)
+    assert 2 * np.degrees(np.arctan(longer / 2)) == pytest.approx(50)
+
+
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("SIMPLE_PINHOLE", [600, 321, 179]),
+        ("PINHOLE", [600, 601, 321, 179]),
+        ("SIMPLE_RADIAL", [600, 321, 179, -0.1]),
+        ("RADIAL", [600, 321, 179, -0.1, 0.02]),
+        ("OPENCV", [600, 602, 321, 179, -0.1, 0.02, 0.001, 0.002]),
+        ("SIMPLE_RADIAL_FISHEYE", [600, 321, 179, -0.1]),
+        ("RADIAL_FISHEYE", [600, 321, 179, -0.1, 0.02]),
+    ],
+)
+@pytest.mark.parametrize(("width", "height", "aspect"), [(320, 360, 2.0), (640, 180, 0.5)])
+def test_a_camera_for_square_pixels_is_scaled_to_squeezed_images_and_fields(model, params, width, height, aspect):
+    camera = pycolmap.Camera(model=model, width=640, height=360, params=params)
+    fitted = fitted_camera(camera, width, height, aspect)
+    assert (fitted.width, fitted.height) == (width, height)
+    rays = np.array([[0.3, -0.2, 1.0], [0.0, 0.1, 1.0], [-0.4, 0.25, 1.0]])
+    scale = np.array([width / 640, height / 360])
+    assert fitted.img_from_cam(rays) == pytest.approx(camera.img_from_cam(rays) * scale, abs=1e-9)
+    assert fitted_camera(camera, 640, 360, 1.0) == camera
+
+
+@pytest.mark.parametrize(("width", "height", "aspect"), [(320, 180, 1.0), (320, 360, 1.0), (320, 360, 1.5)])
+def test_a_camera_for_another_picture_is_refused(width, height, aspect):
+    with pytest.raises(InputError, match=f"made for 640x360 pixels, but the images have {width}x{height}"):
+        fitted_camera(guess_camera(640, 360), width, height, aspect)
 
 
 def test_plain_file_gives_a_pinhole_with_shifted_centre(tmp_path):

@@ -63,6 +63,8 @@ def test_reconstruct_writes_the_result(
         "masks": None,
         "objects": None,
         "frames": None,
+        "fields": "auto",
+        "pixel_aspect": None,
         "lens": "auto",
         "shutter": "auto",
         "control": None,
@@ -83,11 +85,13 @@ def test_options_are_handed_on(tmp_path: Path, calls: list[dict[str, Any]]) -> N
     (tmp_path / "camera.json").write_text(json.dumps(CAMERA))
     arguments = ["--camera", str(tmp_path / "camera.json"), "--depth", "none", "--depth-kind", "metric"]
     arguments += ["--masks", "m", "--objects", "o", "--frames", "5:50:3", "--preset", "paper"]
+    arguments += ["--fields", "blend", "--pixel-aspect", "2"]
     assert main(["reconstruct", "images", "--output", str(tmp_path / "out"), *arguments]) == 0
     (call,) = calls
     assert call["camera"].params.tolist() == [500, 500, 320, 240]
     assert (call["depth"], call["depth_kind"], call["masks"], call["objects"]) == (None, "metric", "m", "o")
     assert (call["frames"], call["preset"]) == (slice(5, 50, 3), "paper")
+    assert (call["fields"], call["pixel_aspect"]) == ("blend", 2.0)
 
 
 def test_progress_is_one_line_on_a_terminal(

@@ -176,6 +176,7 @@ def test_folder_holds_everything_and_the_summary_is_valid_json(tmp_path: Path) -
         "shift": 0.1,
         "shift_std": 0.02,
         "sigma": 0.3,
+        "smooth": 0.0,
     }
     (tmp_path / "camera.json").write_text(json.dumps(summary["camera"]))
     camera = read_camera(tmp_path / "camera.json")

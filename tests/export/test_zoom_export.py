@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pycolmap
 import pytest
 
@@ -62,7 +63,6 @@ def test_nuke_s_focal_length_has_keys(tmp_path: Path) -> None:
 
 
 def test_nuke_reads_a_map_for_every_frame(tmp_path: Path) -> None:
-    openexr = pytest.importorskip("OpenEXR", reason="OpenEXR (extra vfx) is not installed")
     reconstruction, _ = zooming("OPENCV")
     export(reconstruction, tmp_path / "out", format="nuke")
     nodes = nuke_nodes((tmp_path / "out" / "camera.nk").read_text())
@@ -71,7 +71,7 @@ def test_nuke_reads_a_map_for_every_frame(tmp_path: Path) -> None:
     assert (nodes["Map_distort"]["first"], nodes["Map_distort"]["last"]) == (str(frames[0]), str(frames[-1]))
     for number, frame in zip(frames, reconstruction.registered, strict=True):
         assert (tmp_path / "out" / f"distort.{number}.exr").exists()
-        with openexr.File(str(tmp_path / "out" / f"undistort.{number}.exr")) as file:
+        with OpenEXR.File(str(tmp_path / "out" / f"undistort.{number}.exr")) as file:
             found = file.channels()["RGB"].pixels[100, 50, :2]
         camera = frame.camera
         ray = [(50.5 - 290) / camera.focal_length_x, (100.5 - 262) / camera.focal_length_y, 1.0]

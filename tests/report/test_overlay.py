@@ -243,7 +243,7 @@ def replace_width(width: int) -> pycolmap.Camera:
         ("no 'cats' to hide", "o.mp4", "shot.avi", ["cats"]),
         ("say where the shot is", "o.mp4", None, []),
         ("has no frame 4", "o.mp4", "short.avi", []),
-        ("has 320x270 pixels, the result 480x270", "o.mp4", "narrow.avi", []),
+        (r"320x270 pixels \(aspect ratio 1.185\) and the result 480x270 \(1.778\)", "o.mp4", "narrow.avi", []),
         ("does not exist", "o.mp4", "missing.avi", []),
     ],
 )

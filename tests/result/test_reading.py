@@ -100,7 +100,7 @@ def test_read_result_of_a_shot_without_points(tmp_path: Path) -> None:
     assert found.points.shape == found.colors.shape == (0, 3)
     assert found.observation_xy.shape == (0, 2)
     assert len(found.registered) == 5
-    needs = {"usd": "pxr", "stmap": "OpenEXR", "nuke": "OpenEXR", "alembic": "alembic3d"}
+    needs = {"usd": "pxr", "alembic": "alembic3d"}
     for format in set(FORMATS) - {"undistorted"}:
         if format not in needs or find_spec(needs[format]):
             export(found, tmp_path / f"{format}.usda", format=format)

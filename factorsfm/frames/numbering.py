@@ -1,0 +1,84 @@
+"""The numbers of the frames of a folder: those of a numbered sequence are in its file names."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from factorsfm.frames.folders import IMAGE_SUFFIXES, list_images
+from factorsfm.frames.sequences import NUMBERED, sequence_numbers
+from factorsfm.support.errors import InputError
+
+_NAMED_GAPS = 5
+
+
+def numbered_images(folder: Path) -> list[tuple[int, Path]]:
+    """The images of a shot with the numbers of its frames: those in the names of a sequence, else counted from 0.
+
+    Raises:
+        InputError: the folder holds no images, or two files for each frame.
+    """
+    paths = list_images(folder)
+    if not paths:
+        suffixes = ", ".join(sorted(suffix[1:] for suffix in IMAGE_SUFFIXES))
+        raise InputError(f"folder {folder} holds no images ({suffixes})")
+    numbers = sequence_numbers([path.name for path in paths])
+    if numbers is None:
+        _check_one_sequence(folder, paths)
+    return list(zip(range(len(paths)) if numbers is None else numbers, paths, strict=True))
+
+
+def _check_one_sequence(folder: Path, paths: list[Path]) -> None:
+    """Refuse a folder whose files are several whole sequences, such as plates and their previews."""
+    sequences: dict[str, list[int]] = {}
+    for path in paths:
+        match = NUMBERED.fullmatch(path.name)
+        if match is None:
+            return
+        sequences.setdefault(f"{match[1]}{'#' * len(match[2])}{match[3].lower()}", []).append(int(match[2]))
+    if len(sequences) > 1 and len(set(map(tuple, sequences.values()))) == 1 and len(paths) > len(sequences):
+        raise InputError(
+            f"folder {folder} holds {len(sequences)} sequences ({', '.join(sorted(sequences)[:3])}); "
+            "a folder with one of them is expected"
+        )
+
+
+def sequence_of(source: object) -> list[int] | None:
+    """Numbers of the frames of a folder that holds a numbered sequence; None for every other source."""
+    if not (isinstance(source, str | Path) and Path(source).is_dir()):
+        return None
+    return sequence_numbers([path.name for path in list_images(Path(source))])
+
+
+def chosen(images: list[tuple[int, Path]], frames: slice) -> list[tuple[int, Path]]:
+    """The images whose numbers are in a range; the steps begin at the first number that is there.
+
+    Args:
+        frames: see `ranges.checked_range`.
+
+    Raises:
+        InputError: there is none.
+    """
+    first, last = images[0][0], images[-1][0]
+    start = max(frames.start, first)
+    stop = last + 1 if frames.stop is None else frames.stop
+    found = [(number, path) for number, path in images if number in range(start, max(stop, start), frames.step)]
+    if not found:
+        wanted = f"before number {stop}" if stop <= first else f"from number {frames.start} on"
+        if first < stop <= last and first <= frames.start:
+            wanted = f"with the numbers {frames.start} to {stop - 1}"
+        raise InputError(f"{images[0][1].parent} holds no frames {wanted}; its frames are {first} to {last}")
+    return found
+
+
+def missing_numbers(numbers: Sequence[int]) -> str:
+    """The gaps of a sequence in words, "1020 to 1024, 1031"; empty if its numbers have one step throughout."""
+    steps = np.diff(np.asarray(numbers, np.int64))
+    if not len(steps) or (steps == steps[0]).all():
+        return ""
+    step = int(steps.min())
+    gaps = [(numbers[k] + step, numbers[k + 1] - step) for k in np.flatnonzero(steps > step).tolist()]
+    said = [str(first) if first == last else f"{first} to {last}" for first, last in gaps[:_NAMED_GAPS]]
+    return ", ".join(said) + (f" and {len(gaps) - _NAMED_GAPS} more gaps" if len(gaps) > _NAMED_GAPS else "")

@@ -1,0 +1,68 @@
+"""When frames were recorded, from the times at which they are shown: even, uneven, or with frames that repeat."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+# Of the usual interval. Containers round times to a millisecond at worst, which is a tenth at 100 frames a second; a
+# frame that was left out makes 1.
+_UNEVEN = 0.2
+
+_LONGEST_PERIOD = 12  # frames: telecine has 5, animation 4 at most
+# What a cadence has to explain of the repeats, or all but one: the first repeat of a shot is missed.
+_REGULAR, _LEAST_REPEATS = 0.9, 3
+
+
+def frame_interval(indices: Sequence[int], timestamps: Sequence[float | None]) -> float:
+    """Usual seconds between two neighbouring frames of the source, 0 if unknown.
+
+    Args:
+        indices: of some of its frames; timestamps: theirs, seconds.
+    """
+    times = [time for time in timestamps if time is not None]
+    if len(times) < max(2, len(timestamps)):
+        return 0.0
+    gaps = np.diff(indices)
+    return max(float(np.median(np.diff(times) / gaps)), 0.0) if (gaps > 0).all() else 0.0
+
+
+def frame_times(indices: Sequence[int], timestamps: Sequence[float | None]) -> NDArray[np.float64]:
+    """(n,) times of frames, 1 apart where two neighbours of the source are: the timestamps where these are uneven.
+
+    Where they are even or unknown, or do not rise, the times are the indices.
+
+    Args:
+        indices: of the frames; timestamps: theirs, seconds.
+    """
+    even = np.array(indices, np.float64)
+    interval = frame_interval(indices, timestamps)
+    if not interval > 0:
+        return even
+    times = np.array(timestamps, np.float64) / interval
+    steps = np.diff(times)
+    uneven = (steps > 0).all() and np.abs(steps - np.diff(even)).max() > _UNEVEN
+    return times - times[0] + even[0] if uneven else even
+
+
+def are_uneven(indices: Sequence[int], timestamps: Sequence[float | None]) -> bool:
+    """Whether frames come at uneven times; arguments as in `frame_times`."""
+    return not np.array_equal(frame_times(indices, timestamps), indices)
+
+
+def cadence(repeated: Sequence[bool]) -> tuple[int, int] | None:
+    """The rhythm of frames that repeat the one before: in every so many frames so many are new; None without one.
+
+    Args:
+        repeated: of each frame of a shot, in order.
+    """
+    flags = np.asarray(repeated, bool)
+    for period in range(2, min(_LONGEST_PERIOD, len(flags) // 3) + 1):
+        pattern = np.array([flags[phase::period].mean() > 0.5 for phase in range(period)])
+        expected = np.resize(pattern, len(flags))
+        matched, either = int((expected & flags).sum()), int((expected | flags).sum())
+        if matched >= max(min(_REGULAR * either, either - 1), _LEAST_REPEATS):
+            return period, int((~pattern).sum())
+    return None

@@ -1,0 +1,89 @@
+"""Times of frames, and the rhythm of those that repeat."""
+
+import numpy as np
+import pytest
+
+from factorsfm.frames.repeats import RepeatDetector
+from factorsfm.frames.timing import are_uneven, cadence, frame_interval, frame_times
+from tests.video_files import moving_texture
+
+
+def test_even_times_are_the_indices_though_containers_round_them():
+    index = list(range(3, 60, 2))
+    stamps = [round(k / 24, 3) for k in index]
+    assert frame_times(index, stamps).tolist() == index
+    assert frame_interval(index, stamps) == pytest.approx(1 / 24, abs=5e-4)
+    assert not are_uneven(index, stamps)
+
+
+def test_uneven_times_count_in_usual_intervals():
+    """24 frames a second, of which every other one is left out in the second half."""
+    stamps = [k / 24 for k in (0, 1, 2, 3, 4, 5, 7, 9, 11)]
+    times = frame_times(range(9), stamps)
+    assert times == pytest.approx([0, 1, 2, 3, 4, 5, 7, 9, 11])
+    assert are_uneven(range(9), stamps)
+    assert frame_interval(range(9), stamps) == pytest.approx(1 / 24)
+
+
+@pytest.mark.parametrize("stamps", [[None] * 4, [0.0, 0.1, None, 0.3], [0.0, 0.1, 0.1, 0.1], [3.0, 2.0, 1.0, 0.0]])
+def test_times_that_are_unknown_or_do_not_rise_are_no_times(stamps):
+    assert frame_times([0, 1, 2, 3], stamps).tolist() == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize(
+    ("pattern", "period", "new"),
+    [("nnnnr", 5, 4), ("nr", 2, 1), ("nnr", 3, 2), ("nrnrr", 5, 2), ("nrr", 3, 1)],
+)
+def test_a_cadence_is_found_though_a_repeat_is_missed(pattern, period, new):
+    flags = np.resize(np.array([c == "r" for c in pattern]), 60)
+    assert cadence(flags.tolist()) == (period, new)
+    flags[int(np.flatnonzero(flags)[0])] = False
+    assert cadence(flags.tolist()) == (period, new)
+
+
+def test_dropped_frames_have_no_cadence():
+    flags = np.zeros(100, bool)
+    flags[[7, 20, 22, 51, 83]] = True
+    assert cadence(flags.tolist()) is None
+    assert cadence([False] * 50) is None
+
+
+def grainy(images):
+    """Sensor noise of 2 grey levels, new in each image."""
+    rng = np.random.default_rng(1)
+    return [np.clip(image[:, :, 0] + rng.normal(0, 2, image.shape[:2]), 0, 255).astype(np.uint8) for image in images]
+
+
+@pytest.mark.parametrize("step", [0.0, 0.2, 3.0])
+def test_repeats_are_told_from_new_frames(step):
+    images = grainy(moving_texture(40, step))
+    rng = np.random.default_rng(2)
+    shown = [k for k in range(40) for _ in range(2 if k % 4 == 3 else 1)]
+    detector, found = RepeatDetector(), []
+    for k, number in enumerate(shown):
+        compressed = images[number].astype(np.int16) + rng.integers(-1, 2, images[number].shape) * (k % 2) * (step > 0)
+        found.append(detector.push(np.clip(compressed, 0, 255).astype(np.uint8) if step > 1 else images[number]))
+    expected = [k > 0 and shown[k] == shown[k - 1] for k in range(len(shown))]
+    assert found == expected
+
+
+def test_images_that_all_are_the_same_repeat_none():
+    detector = RepeatDetector()
+    assert not any(detector.push(moving_texture(1)[0][:, :, 0]) for _ in range(20))
+
+
+@pytest.mark.parametrize("shown", [0, 255])
+def test_new_frames_after_a_blank_stretch_repeat_none(shown):
+    """The step into the image is large, beside which its motion is small."""
+    blank = np.full((240, 320), shown, np.uint8)
+    detector = RepeatDetector()
+    assert not any(detector.push(image) for image in [blank] * 2 + [i[:, :, 0] for i in moving_texture(10, 0.3)])
+
+
+def test_a_camera_that_stops_is_no_long_row_of_repeats():
+    images = moving_texture(12, 2.0)
+    detector = RepeatDetector()
+    found = [detector.push(image[:, :, 0]) for image in images + [images[-1]] * 20]
+    assert not any(found[:12])
+    assert found[12:16] == [True, True, True, False]
+    assert not any(found[15:])
