@@ -124,6 +124,9 @@ def test_a_fade_in_spoils_nothing(shared_data: Path, shared_models: Path, tmp_pa
     assert all(" of " in frame.message and " needed " in frame.message for frame in dark if not frame.registered)
     seen = np.bincount(result.observation_frame, minlength=len(result.frames))
     for k, frame in enumerate(result.frames):
+        if frame.repeats is not None:  # it changes little beside the end of the fade: it is where its twin is
+            np.testing.assert_array_equal(frame.covariance, result.frames[k - 1].covariance)
+            continue
         assert (
             frame.registered == (seen[k] >= 15) == (frame.covariance is not None) == (frame.observability is not None)
         )

@@ -93,7 +93,9 @@ def test_a_rendered_zoom_is_followed(shot, reconstruction):
     focals = np.array([reconstruction.camera_of(frame).mean_focal_length() for frame in reconstruction.frames])
     course = focals / focals[0]
     assert 5e-4 < np.abs(course / shot.zoom - 1).max() < 0.004
-    assert not reconstruction.lens.determined  # only its course
+    assert reconstruction.lens.determined
+    assert 3e-4 < np.abs(focals / (shot.camera.mean_focal_length() * shot.zoom) - 1).max() < 0.015
+    assert 0.01 < reconstruction.lens.focal_std.max() < 0.03
     assert 2e-4 < reconstruction.lens.zoom_std < 1.5e-3
     assert focal_range(reconstruction) == pytest.approx((focals.min(), focals.max()))
     assert any("changes from" in note for note in reconstruction.notes)

@@ -122,7 +122,7 @@ def test_every_form_of_image_gives_the_same_tracks(form):
             "grey": grey,
             "grey_channel": grey[..., None],
             "bgra": cv2.cvtColor(image, cv2.COLOR_BGR2BGRA),
-            "uint16": image.astype(np.uint16) * 256,
+            "uint16": image.astype(np.uint16) * 257,
             "frame": Frame(k, grey, f"{k:06d}"),
         }[form]
 
