@@ -72,6 +72,27 @@ def make_problem(motion, *, frames=10, points=100, parallax=0.05, noise_px=0.0, 
     return Problem(truth, points, observations, focal, noise_px)
 
 
+def with_points(problem, points, pixels):
+    """The problem with further points, which all frames see.
+
+    Args:
+        points: (n, 3), where the solution has them; pixels: (n, frames, 2) where they are seen, whatever moves them.
+    """
+    truth, o, first, frames = problem.truth, problem.observations, len(problem.points), problem.frames
+    observations = Observations(
+        np.r_[o.frame, np.tile(np.arange(frames), len(points))],
+        np.r_[o.point, np.repeat(first + np.arange(len(points)), frames)],
+        np.r_[o.pixels, pixels.reshape(-1, 2)],
+    )
+    distance = np.linalg.norm(points, axis=1)
+    truth = replace(
+        truth,
+        bearing=np.r_[truth.bearing, points / distance[:, None]],
+        inverse_distance=np.r_[truth.inverse_distance, 1.0 / distance],
+    )
+    return replace(problem, truth=truth, points=np.r_[problem.points, points], observations=observations)
+
+
 def pinhole(focal):
     return pycolmap.Camera(model="SIMPLE_PINHOLE", width=640, height=360, params=[focal, 320.0, 180.0])
 

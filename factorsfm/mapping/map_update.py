@@ -89,12 +89,14 @@ def _extended(copy: MapCopy, graph: KeyframeGraph) -> MapUpdate:
     ids, others = choose_landmarks(images, ids[fits], copy.added.tracks)
     others = np.union1d(others, np.setdiff1d(contradicting, laid_over))
     result = _solved(copy, graph, images, constant, ids, iterations)
-    burn_ins, removed, moving = burn_ins_of(copy, images, constant, result.window), ids[:0], 0
+    burn_ins, removed, moving = burn_ins_of(result.window), ids[:0], 0
     scene = np.setdiff1d(ids, burn_ins) if len(burn_ins) else scene_alone(copy, images, result.window, mapped)
     if not np.array_equal(scene, ids):
+        tried = ids if len(burn_ins) else mapped
         moving = 0 if len(burn_ins) else len(mapped) - len(scene)
         ids = lifted_anew(copy, images, scene)
-        removed, others = np.setdiff1d(mapped, ids), ids[:0]
+        removed = np.setdiff1d(tried, ids)
+        others = np.setdiff1d(others, tried)
         result = _solved(copy, graph, images, constant, ids, _YOUNG_ITERATIONS)
     if not result.committed:
         return MapUpdate(position, depth, False, result.reason, mirrored=result.mirrored)

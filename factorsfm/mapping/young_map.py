@@ -64,7 +64,7 @@ def resting_among(images: list[MappedImage], ids: Index, suspects: NDArray[np.bo
     return ids[suspects & resting(gather([image.tracks for image in images], ids, focal))]
 
 
-def burn_ins_of(copy: MapCopy, images: list[MappedImage], constant: NDArray[np.bool_], window: Window) -> Index:
+def burn_ins_of(window: Window) -> Index:
     """Tracks that rest in the image and contradict the others, when both go on from a solution with all of them."""
     together = _adjustment(window)
     rests = resting(together.observations)

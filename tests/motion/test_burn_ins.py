@@ -1,12 +1,10 @@
 """Captions and logos that stay in the image: left out where they contradict the scene, and only there."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from factorsfm.adjustment.observations import Observations
 from factorsfm.graph.keyframe_graph import KeyframeGraph
+from factorsfm.mapping import graph_window, map_update
 from factorsfm.mapping.map_copy import MapCopy
 from factorsfm.mapping.map_update import update_map
 from factorsfm.mapping.point_map import PointMap
@@ -14,7 +12,7 @@ from factorsfm.motion.burn_ins import resting
 from factorsfm.polish.camera_starts import best_solution
 from factorsfm.support.options import MapperOptions, Options, TrackerOptions
 from factorsfm.tracks.flow import FlowTracker
-from tests.estimation_problems import angles_between, make_problem, mapped_images, perturbed
+from tests.estimation_problems import angles_between, make_problem, mapped_images, perturbed, with_points
 
 CAPTIONS = 40
 
@@ -22,21 +20,11 @@ CAPTIONS = 40
 def captioned(motion, parallax, count=CAPTIONS):
     """A problem whose last `count` points rest in the image; how many of its points do not."""
     problem = make_problem(motion, frames=16, points=160, parallax=parallax, noise_px=0.1)
-    truth, o, n, k = problem.truth, problem.observations, len(problem.points), problem.frames
     at = np.random.default_rng(0).uniform([-0.4, -0.25], [0.4, 0.25], (count, 2))
-    observations = Observations(
-        np.r_[o.frame, np.tile(np.arange(k), count)],
-        np.r_[o.point, np.repeat(n + np.arange(count), k)],
-        np.r_[o.pixels, problem.focal * np.repeat(at, k, 0)],
-    )
     rays = np.column_stack([at, np.ones(count)])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    truth = replace(
-        truth,
-        bearing=np.r_[truth.bearing, rays],
-        inverse_distance=np.r_[truth.inverse_distance, np.ones(count)],
-    )
-    return replace(problem, truth=truth, points=np.r_[problem.points, rays], observations=observations), n
+    pixels = problem.focal * np.repeat(at[:, None], problem.frames, 1)
+    return with_points(problem, rays, pixels), len(problem.points)
 
 
 @pytest.mark.parametrize(("count", "found"), [(CAPTIONS, CAPTIONS), (5, 0)])
@@ -86,6 +74,24 @@ def test_the_map_takes_captions_out_at_once(motion, found):
     np.testing.assert_array_equal(update.burn_ins, captions)
     assert np.isin(captions, update.removed).all()
     assert not np.isin(captions, update.ids).any()
+
+
+def test_captions_take_nothing_else_out_of_an_old_map(monkeypatch):
+    """Points that the graph has no room for stay in the map."""
+    problem, scene = captioned("handheld", 0.05)
+    images = mapped_images(problem, perturbed(problem.truth, angle_rad=0.001, shift=0.003, structure=0.03))[:8]
+    outside = np.arange(30)  # the newest keyframe does not see them
+    images[-1].forget_tracks(outside)
+    monkeypatch.setattr(graph_window, "_MOST_LANDMARKS", len(problem.points) - len(outside))
+    monkeypatch.setattr(map_update, "fits_pose", lambda image, ids, *_: np.ones(len(ids), bool))  # a map that they bent
+    points = PointMap()
+    far = np.where(np.arange(len(problem.points)) < scene, 1.0, 30.0)[:, None]
+    points.set(np.arange(len(problem.points)), problem.points * far)
+    update = update_map(MapCopy(images, points, MapperOptions(), problem.focal), KeyframeGraph())
+    assert update.committed
+    np.testing.assert_array_equal(update.burn_ins, np.arange(scene, len(problem.points)))
+    np.testing.assert_array_equal(update.removed, update.burn_ins)
+    np.testing.assert_array_equal(update.ids, np.arange(scene))
 
 
 def test_no_track_starts_again_on_a_caption():

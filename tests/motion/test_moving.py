@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
-from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import ErrorModel
 from factorsfm.motion.moving import as_exact, bounded_costs, largest_cost, standing_out
 from factorsfm.polish.camera_starts import best_solution
 from factorsfm.support.options import Options, PolishOptions
 from factorsfm.tracks.flow import _moves_otherwise
-from tests.estimation_problems import angles_between, centers, in_unit_of, make_problem, perturbed
+from tests.estimation_problems import angles_between, centers, in_unit_of, make_problem, perturbed, with_points
 
 WALKER = 24
 
@@ -20,24 +19,13 @@ WALKER = 24
 def with_walker(parallax, count=WALKER):
     """A problem whose last `count` points cross the image on a rigid body; how many are the scene's; the body's way."""
     problem = make_problem("handheld", frames=16, points=160, parallax=parallax, noise_px=0.1)
-    truth, o, n, k = problem.truth, problem.observations, len(problem.points), problem.frames
+    truth, k = problem.truth, problem.frames
     rng = np.random.default_rng(0)
     body = rng.uniform([-0.12, -0.2, 0.75], [0.0, 0.2, 0.85], (count, 3))
     way = np.linspace(0.0, 1.0, k)[:, None] * [0.3, 0.02, 0.05]
     seen = np.einsum("kij,nkj->nki", truth.rotation, body[:, None] + way) + truth.translation
     xy = seen[..., :2] / seen[..., 2:] * problem.focal + problem.noise_px * rng.standard_normal((count, k, 2))
-    observations = Observations(
-        np.r_[o.frame, np.tile(np.arange(k), count)],
-        np.r_[o.point, np.repeat(n + np.arange(count), k)],
-        np.r_[o.pixels, xy.reshape(-1, 2)],
-    )
-    distance = np.linalg.norm(body, axis=1)
-    truth = replace(
-        truth,
-        bearing=np.r_[truth.bearing, body / distance[:, None]],
-        inverse_distance=np.r_[truth.inverse_distance, 1.0 / distance],
-    )
-    return replace(problem, truth=truth, points=np.r_[problem.points, body], observations=observations), n, way
+    return with_points(problem, body, xy), len(problem.points), way
 
 
 def path_error(solved, problem, scene):

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factorsfm.adjustment.observations import Observations
 from factorsfm.graph.keyframe_graph import KeyframeGraph
 from factorsfm.mapping.map_copy import MapCopy
 from factorsfm.mapping.map_update import update_map
@@ -14,7 +13,7 @@ from factorsfm.motion.readings import solution_from
 from factorsfm.motion.turning import turning_groups
 from factorsfm.polish.camera_starts import best_solution
 from factorsfm.support.options import MapperOptions, Options, PolishOptions
-from tests.estimation_problems import angles_between, make_problem, mapped_images, perturbed
+from tests.estimation_problems import angles_between, make_problem, mapped_images, perturbed, with_points
 
 SMALL_PX = 0.1
 
@@ -33,25 +32,14 @@ def with_follower(count, width, frames=16):
     edge = (width - 0.5) * 640 / problem.focal
     first = o.pixels[o.first, 0] / problem.focal
     scene = np.flatnonzero(first > edge)
-    truth, o, points = truth.of(scene), o.of(scene), problem.points[scene]
-    rng, n = np.random.default_rng(0), len(scene)
+    rng = np.random.default_rng(0)
     body = np.column_stack([rng.uniform(-320 / problem.focal, edge, count), rng.uniform(-0.25, 0.25, count)])
     body = np.column_stack([body, np.ones(count)]) * rng.uniform(0.45, 0.55, count)[:, None]
     sway = 0.004 * np.sin(np.arange(k)[:, None] * [1.3, 0.7, 0.4])
     seen = body[:, None] + sway
     xy = problem.focal * seen[..., :2] / seen[..., 2:] + SMALL_PX * rng.standard_normal((count, k, 2))
-    observations = Observations(
-        np.r_[o.frame, np.tile(np.arange(k), count)],
-        np.r_[o.point, np.repeat(n + np.arange(count), k)],
-        np.r_[o.pixels, xy.reshape(-1, 2)],
-    )
-    distance = np.linalg.norm(body, axis=1)
-    truth = replace(
-        truth,
-        bearing=np.r_[truth.bearing, body / distance[:, None]],
-        inverse_distance=np.r_[truth.inverse_distance, 1.0 / distance],
-    )
-    return replace(problem, truth=truth, points=np.r_[points, body], observations=observations), n
+    part = replace(problem, truth=truth.of(scene), points=problem.points[scene], observations=o.of(scene))
+    return with_points(part, body, xy), len(scene)
 
 
 @pytest.mark.parametrize("count", [40, 120])
