@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from factorsfm.adjustment.residuals import camera_points
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.mapping.point_map import PointMap
-from factorsfm.mapping.registration import Registration, inlier_threshold, register_image
+from factorsfm.mapping.registration import Registration, inlier_threshold, register_image, residuals
 from factorsfm.support.options import MapperOptions
 from factorsfm.support.status import FrameStatus
 
@@ -102,9 +102,7 @@ def fits_pose(
         image: sees some of them; focal: pixels.
     """
     seen, tracks = np.isin(ids, image.tracks.ids), image.tracks
-    q = camera_points(*image.pose, points.at(ids[seen]), np.ones(int(seen.sum())))
-    z = np.where(q[:, 2] > 0.0, q[:, 2], 1e-9)
-    error = focal * np.linalg.norm(q[:, :2] / z[:, None] - tracks.xy[np.isin(tracks.ids, ids)], axis=1)
+    error = residuals(points.at(ids[seen]), tracks.xy[np.isin(tracks.ids, ids)], *image.pose, focal)
     inliers = error < inlier_threshold(error, options.inlier_px)
     fits = np.ones(len(ids), bool)
     fits[seen] = inliers | (inliers.sum() < options.min_inliers)

@@ -19,10 +19,8 @@ Array = NDArray[np.float64]
 
 _KERNEL = 2.0  # Cauchy scale in standard deviations
 _ALIGN_STEPS = 20  # at most
-_NARROWINGS, _SETTLED = (
-    10,
-    0.95,
-)  # of the kernel, at most; ratio of the spread to that before, above which it is the last
+_NARROWINGS = 10  # of the kernel, at most
+_SETTLED = 0.95  # ratio of the spread of the residuals to that before, above which the kernel narrows no more
 _ROUGHLY, _FULLY = 1e-3, 1e-6  # relative decrease of the cost with which the alignment ends
 _BEHIND = 1e3  # residual of a point behind the camera, standard deviations
 _DEPTH_FLOOR = 0.03  # smallest believable relative error of a depth network
@@ -79,7 +77,7 @@ def register_image(
         if start is not None:
             other = _refine(points, observed, *start, focal, sigma, inlier_px)
             # Compared at the narrow threshold: a wide one counts what it was widened for.
-            errors = [_residuals(points, observed, r.rotation, r.translation, focal) for r in (result, other)]
+            errors = [residuals(points, observed, r.rotation, r.translation, focal) for r in (result, other)]
             if (errors[1] < inlier_px).sum() > (errors[0] < inlier_px).sum():
                 result = other
     if depth is None or not (use := result.inliers & depth.valid).sum() >= 10:
@@ -87,7 +85,8 @@ def register_image(
     return _refine_with_depth(result, points, observed, use, focal, sigma, depth, domain, depth_weight)
 
 
-def _residuals(points: Array, observed: Array, rotation: Array, translation: Array, focal: float) -> Array:
+def residuals(points: Array, observed: Array, rotation: Array, translation: Array, focal: float) -> Array:
+    """(n,) reprojection errors in pixels, infinite behind the camera; arguments as in `register_image`."""
     x, y, z = rotation @ points.T + translation[:, None]
     behind = z <= 1e-6
     z[behind] = 1.0
@@ -100,6 +99,11 @@ def _typical(error: Array) -> float:
     """What the median of the errors would be without outliers, which may be up to two thirds of them."""
     rank = int(0.3 * (len(error) - 1))
     return 1.39 * float(np.partition(error, rank)[rank])
+
+
+def _spread(error: Array, sigma: float) -> float:
+    """Width of a kernel that follows the errors, and no narrower than the noise of a keypoint, pixels."""
+    return min(max(sigma, _typical(error)), 100.0 * sigma)
 
 
 def inlier_threshold(error: Array, inlier_px: float) -> float:
@@ -122,7 +126,7 @@ def _turned(points: Array, observed: Array, rotation: Array, translation: Array,
         residual = prediction - seen
         residual[:, ~front] = _BEHIND
         error = np.hypot(*residual)
-        spread = min(max(sigma, _typical(error)), 100.0 * sigma)
+        spread = _spread(error, sigma)
         if spread > _SETTLED * before:
             break
         weight = front / (1.0 + (error / (_KERNEL * spread)) ** 2)
@@ -193,14 +197,14 @@ def _refine(
     """
     turned = _turned(points, observed, rotation, translation, focal, sigma)
     rotation, translation = turned, turned @ rotation.T @ translation
-    error = _residuals(points, observed, rotation, translation, focal)
-    information, spread, settled = np.eye(6), np.inf, False
+    error = residuals(points, observed, rotation, translation, focal)
+    information, spread = np.eye(6), np.inf
     for _ in range(_NARROWINGS):
-        before, spread = spread, min(max(sigma, _typical(error)), 100.0 * sigma)
+        before, spread = spread, _spread(error, sigma)
         settled = spread == sigma or spread > _SETTLED * before
         tolerance = _FULLY if settled else _ROUGHLY
         rotation, translation, information = _align(points, observed, rotation, translation, focal, spread, tolerance)
-        error = _residuals(points, observed, rotation, translation, focal)
+        error = residuals(points, observed, rotation, translation, focal)
         if settled:
             break
     threshold = inlier_threshold(error, inlier_px)
@@ -249,7 +253,7 @@ def _refine_with_depth(
     rotation, translation, scale, shift = solve_pose_and_affine(
         [reprojections, depths], result.rotation, result.translation, scale, shift
     )
-    error = _residuals(points, observed, rotation, translation, focal)
+    error = residuals(points, observed, rotation, translation, focal)
     inliers = error < result.threshold
     if inliers.sum() < 0.8 * result.inliers.sum():
         return result

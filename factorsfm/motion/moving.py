@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
+from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.residuals import cauchy
 
 _SIGMAS = 10.0  # of an observation: a typical error beyond is not one of tracking
@@ -25,9 +26,8 @@ SPOILT = 0.98
 
 def standing_out(adjustment: BundleAdjustment) -> NDArray[np.bool_]:
     """(n,) which points a solution does not explain at all; none where they are too few to do harm."""
-    size = _log_errors(adjustment)
-    center = np.median(size)
-    spread = 1.4826 * np.median(np.abs(size - center))
+    size = log_errors(adjustment.observations, adjustment.reprojection_errors())
+    center, spread = center_and_spread(size)
     found = (size > np.log(_SIGMAS * adjustment.sigma)) & (size > center + _SPREADS * spread)
     return np.asarray(found & (found.sum() >= max(_LEAST, _LEAST_SHARE * len(found))))
 
@@ -38,16 +38,20 @@ def as_exact(adjustment: BundleAdjustment, members: NDArray[np.bool_]) -> NDArra
     Args:
         adjustment: of all points, with cameras from the members alone; members: (n,).
     """
-    size = _log_errors(adjustment)
-    center = np.median(size[members])
-    spread = max(1.4826 * float(np.median(np.abs(size[members] - center))), _LEAST_SPREAD)
-    return np.asarray(members | (size < center + _SPREADS * spread))
+    size = log_errors(adjustment.observations, adjustment.reprojection_errors())
+    center, spread = center_and_spread(size[members])
+    return np.asarray(members | (size < center + _SPREADS * max(spread, _LEAST_SPREAD)))
 
 
-def _log_errors(adjustment: BundleAdjustment) -> NDArray[np.float64]:
-    """(n,) logarithms of the typical reprojection errors of the points (pixels)."""
-    typical = np.sqrt(adjustment.observations.mean_by_point(adjustment.reprojection_errors() ** 2))
-    return np.asarray(np.log(typical + 1e-6))
+def log_errors(observations: Observations, errors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n,) logarithms of the typical errors of the points, from those of the observations (m,), pixels."""
+    return np.asarray(np.log(np.sqrt(observations.mean_by_point(errors**2)) + 1e-6))
+
+
+def center_and_spread(values: NDArray[np.float64]) -> tuple[float, float]:
+    """Median, and the robust standard deviation around it."""
+    center = float(np.median(values))
+    return center, 1.4826 * float(np.median(np.abs(values - center)))
 
 
 def bounded_costs(adjustment: BundleAdjustment, sigma: float) -> NDArray[np.float64]:

@@ -65,8 +65,8 @@ def most_likely(readings: Sequence[Reading], observations: Observations) -> tupl
 def _refutes(reading: Reading, known: Reading, few: Observations) -> bool:
     """Whether a reading explains the points that it keeps far better than another reading does."""
     mine = np.isin(few.point, reading.kept)
-    cost, known_cost = (_costs(s, few, reading.adjustment.sigma)[mine].sum() for s in (reading, known))
-    return bool(cost < _REFUTED * known_cost)
+    own, other = (_costs(s, few, reading.adjustment.sigma)[mine].sum() for s in (reading, known))
+    return bool(own < _REFUTED * other)
 
 
 def cost(reading: Reading, few: Observations, sigma: float) -> float:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.adjustment.observations import Observations
+from factorsfm.motion.moving import center_and_spread, log_errors
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -33,9 +34,8 @@ def agreeing(observations: Observations, errors: Array, suspected: Flags) -> Fla
     """
     if not suspected.any() or suspected.all():
         return ~suspected
-    size = np.log(np.sqrt(observations.mean_by_point(errors**2)) + 1e-6)
-    center = np.median(size[~suspected])
-    spread = 1.4826 * np.median(np.abs(size[~suspected] - center))
+    size = log_errors(observations, errors)
+    center, spread = center_and_spread(size[~suspected])
     exact = size[suspected] < center + _EXACT * max(spread, _LEAST_SPREAD)
     result = ~suspected
     result[suspected] = exact & (_share_nearby(_places(observations)[suspected], exact) > _SHARE)

@@ -88,9 +88,9 @@ def _doubtful(found: CameraSolution, options: Options) -> bool:
 def _of_one_group(known: CameraSolution, start: State, few: Observations, options: Options) -> CameraSolution:
     """The solution from one of the groups that turn together, where it refutes the known one and explains more."""
     groups = turning_groups(few, start.normalized(few), float(np.median(start.focal)))
-    readings = [from_group(group, start, few, options.polish) for group in groups]
     solutions = [known]
-    for reading in readings:
+    for group in groups:
+        reading = from_group(group, start, few, options.polish)
         found = _without_moving(reading.adjustment, options)
         moving = found.moving + len(start.bearing) - len(reading.kept)
         solutions.append(replace(found, kept=reading.kept[found.kept], moving=moving))

@@ -18,6 +18,7 @@ from factorsfm.lens.rolling_shutter import Shutter, find_shutter
 from factorsfm.lens.zoom import find_zoom
 from factorsfm.mapping.all_points import triangulated, with_all_points
 from factorsfm.motion.at_rest import Rest
+from factorsfm.motion.moving import center_and_spread, log_errors
 from factorsfm.motion.readings import solution_from
 from factorsfm.motion.shot_kind import Motion, classify_motion
 from factorsfm.motion.suspects import agreeing
@@ -219,9 +220,8 @@ def _with_fitting_tracks(
 
 def _usual_points(observations: Observations, errors: Array, usual: Index, options: PolishOptions) -> Index:
     """Points whose typical error is not far outside that of the usual ones (log scale, robust)."""
-    typical = np.log(np.sqrt(observations.mean_by_point(errors**2)) + 1e-6)
-    center = np.median(typical[usual])
-    spread = 1.4826 * np.median(np.abs(typical[usual] - center))
+    typical = log_errors(observations, errors)
+    center, spread = center_and_spread(typical[usual])
     return np.nonzero(typical < center + options.outlier_sigmas * max(spread, 0.1))[0]
 
 
