@@ -60,7 +60,8 @@ def serve() -> None:
     for number in (signal.SIGINT, signal.SIGTERM):  # what ends the parent ends this process, too, but not before
         signal.signal(number, signal.SIG_IGN)
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # what libraries print must not get in between
+    with open(os.devnull, "wb") as nowhere:  # GTSAM prints of every landmark behind a camera that it tries
+        os.dup2(nowhere.fileno(), sys.stdout.fileno())
     kept = _Kept()
     logging.getLogger().addHandler(kept)
     graph = KeyframeGraph()

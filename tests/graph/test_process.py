@@ -160,6 +160,12 @@ def test_what_is_logged_there_is_logged_here(graph, shot, caplog):
     assert caplog.messages == [f"update at frame 7 rolled back: {update.reason}"]
 
 
+def test_what_libraries_print_there_is_not_seen(graph, capfd):
+    assert graph.ask(updates.print_from_a_library, "subject") == "subject"
+    graph.close()
+    assert capfd.readouterr() == ("", "")
+
+
 def test_another_map_begins_with_an_empty_graph(graph, shot):
     submit_update(graph, shot.copy(8), None).result()
     graph.start_anew()

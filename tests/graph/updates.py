@@ -28,6 +28,11 @@ def slow_echo(subject: Any, graph: KeyframeGraph) -> Any:
     return subject
 
 
+def print_from_a_library(subject: Any, graph: KeyframeGraph) -> Any:
+    os.write(1, b"landmark behind a camera\n")
+    return subject
+
+
 def never(subject: Any, graph: KeyframeGraph) -> None:
     time.sleep(1000.0)
 
