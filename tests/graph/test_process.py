@@ -160,7 +160,7 @@ def test_what_is_logged_there_is_logged_here(graph, shot, caplog):
     assert caplog.messages == [f"update at frame 7 rolled back: {update.reason}"]
 
 
-def test_what_libraries_print_there_is_not_seen(graph, capfd):
+def test_what_libraries_print_there_is_not_seen(capfd, graph):
     assert graph.ask(updates.print_from_a_library, "subject") == "subject"
     graph.close()
     assert capfd.readouterr() == ("", "")
