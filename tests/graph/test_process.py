@@ -160,9 +160,9 @@ def test_what_is_logged_there_is_logged_here(graph, shot, caplog):
     assert caplog.messages == [f"update at frame 7 rolled back: {update.reason}"]
 
 
-def test_what_libraries_print_there_is_not_seen(capfd, graph):
-    assert graph.ask(updates.print_from_a_library, "subject") == "subject"
-    graph.close()
+def test_what_libraries_print_there_is_not_seen(capfd):
+    with GraphProcess() as graph:  # started under the capture
+        assert graph.ask(updates.print_from_a_library, "subject") == "subject"
     assert capfd.readouterr() == ("", "")
 
 
