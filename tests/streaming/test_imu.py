@@ -248,8 +248,8 @@ def test_attempts_that_fail_become_rarer(monkeypatch):
         raise ReconstructionError("it does not fit")
 
     monkeypatch.setattr(imu_source, "fit_timing", fails)
-    source, mapper = ImuSource(recording()), SimpleNamespace(starts_anew=False, keyframes=[], images=[])
-    mapper.started = True
+    source = ImuSource(recording())
+    mapper = SimpleNamespace(starts_anew=False, keyframes=[], images=[], refines_focal=False, started=True)
     for k in range(1200):
         mapper.keyframes.append(k)
         source.follow(mapper, k / 2)
