@@ -1,5 +1,4 @@
-"""Factors of the caller as a term of the polish: on its poses, its affines, and landmarks that are variables of their
-own.
+"""Factors of the caller as a term of the polish: on its poses and affines, and on landmarks, variables of their own.
 
 The factors are in the world of the live map. The alignment from the world of the polish to that, and the landmarks that
 the factors name, are `State.control` as in `residuals`. The alignment passes through the first camera; its rotation is

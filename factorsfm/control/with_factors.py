@@ -69,9 +69,8 @@ def solve_with_factors(
         residuals, [], unused, placed=True, scale_std=scale_std, position_std=position_std, source="factors",
     ))  # fmt: skip
     agreeing = [row for row, residual in enumerate(residuals) if not residual.contradicts]
-    if controlled.fit.scale_std < SCALE_STD and term.agree_on_scale(solved.state, agreeing):
-        return controlled
-    return controlled.without_unit()
+    known = term.determines_scale and controlled.fit.scale_std < SCALE_STD
+    return controlled if known and term.agree_on_scale(solved.state, agreeing) else controlled.without_unit()
 
 
 def _alignment(state: State, factors: ShotFactors, frames: list[int]) -> tuple[Array, Array, Array, float]:
