@@ -176,15 +176,12 @@ def test_clocks_are_told_in_a_fitting_unit(offset, said):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 2])
-def test_with_an_unknown_lens_the_imu_joins_the_polish(seed):
+def test_with_an_unknown_lens_the_imu_joins_the_polish():
     """Lens, clock and axes unknown; lengths within 2 %."""
-    path = handheld_path(SECONDS + 0.5, seed)
-    true_rotations, true_centers = pose_arrays(path.poses(TIMES))
-    shot = images() if seed == 1 else list(render_views(path.poses(TIMES), 320, 180, 1))
-    with Stream(imu=unknown(recording(path, seed))) as stream:
-        for k, image in enumerate(shot):
-            stream.push(Frame(k, image, f"{k:06d}", timestamp=float(TIMES[k])))
+    true_rotations, true_centers = truth()
+    with Stream(imu=unknown(recording())) as stream:
+        for frame in frames():
+            stream.push(frame)
         assert stream._imu.reason == "the lens is not known while frames arrive"
         result = stream.finish()
     assert result.metric
