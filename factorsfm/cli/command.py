@@ -124,6 +124,16 @@ def add_footage(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_imu(parser: argparse.ArgumentParser) -> None:
+    """Declare the recording of an IMU."""
+    parser.add_argument(
+        "--imu",
+        type=Path,
+        metavar="FILE",
+        help="recording of an IMU on the camera (CSV, .gcsv, or a JSON file that names one): the result is metric",
+    )
+
+
 def range_of(arguments: argparse.Namespace) -> slice | None:
     """The range of frames, None for all.
 

@@ -11,6 +11,7 @@ from factorsfm.camera.files import open_camera
 from factorsfm.cli.command import (
     Command,
     add_footage,
+    add_imu,
     add_method,
     add_objects,
     add_output,
@@ -51,12 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE.json",
         help="known poses, points, distances and heights: the result is in their world and unit",
     )
-    parser.add_argument(
-        "--imu",
-        type=Path,
-        metavar="FILE",
-        help="recording of an IMU on the camera (CSV, .gcsv, or a JSON file that names one): the result is metric",
-    )
+    add_imu(parser)
     parser.add_argument(
         "--work",
         type=Path,

@@ -20,6 +20,7 @@ from factorsfm.camera.files import camera_to_json, open_camera
 from factorsfm.cli.command import (
     Command,
     add_footage,
+    add_imu,
     add_method,
     add_output,
     add_range,
@@ -33,6 +34,8 @@ from factorsfm.cli.stream_results import StreamResults
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.live_sources import Source, open_source
 from factorsfm.frames.raw import RawFormat
+from factorsfm.inertial.mounting import open_imu
+from factorsfm.inertial.recording import ImuRecording
 from factorsfm.priors.depth import DepthPrior, open_depth
 from factorsfm.priors.masks import MaskPrior, open_masks
 from factorsfm.report.result_folder import check_directory
@@ -61,6 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_method(parser)
     add_range(parser)
     add_footage(parser)
+    add_imu(parser)
     parser.add_argument(
         "--raw", metavar="WxH:FORMAT", help="size and pixels of raw frames: bgr24, rgb24, gray8, yuv420p or nv12"
     )
@@ -135,6 +139,7 @@ class _Inputs:
     camera: pycolmap.Camera | None
     depth: DepthPrior | None
     masks: MaskPrior | None
+    imu: ImuRecording | None
     options: Options
     frames: slice | None
     raw: RawFormat | None
@@ -148,6 +153,7 @@ def _open_inputs(arguments: argparse.Namespace) -> _Inputs:
         raw=RawFormat.parse(arguments.raw) if arguments.raw else None,
         depth=open_depth(unless_none(arguments.depth), arguments.depth_kind) if options.uses_depth else None,
         masks=open_masks(unless_none(arguments.masks)),
+        imu=open_imu(arguments.imu) if arguments.imu else None,
         options=options,
     )
 
@@ -182,7 +188,7 @@ def _begin(given: _Inputs, results: StreamResults, *, cuts: bool) -> Stream | Ep
             options=given.options,
             finished=results.write_shot,
         )
-    return Stream(given.camera, depth=given.depth, masks=given.masks, options=given.options)
+    return Stream(given.camera, depth=given.depth, masks=given.masks, options=given.options, imu=given.imu)
 
 
 class _Line:
@@ -215,6 +221,8 @@ def _check(arguments: argparse.Namespace) -> None:
         raise InputError("--snapshot-every needs --snapshot FILE")
     if arguments.cuts and (arguments.snapshot or arguments.resume):
         raise InputError("--cuts cannot be combined with --snapshot or --resume")
+    if arguments.cuts and arguments.imu:
+        raise InputError("--cuts cannot be combined with --imu: the recording of an IMU is of one shot")
     if arguments.snapshot and not arguments.snapshot.absolute().parent.is_dir():
         raise InputError(f"snapshot {arguments.snapshot} cannot be written: its folder does not exist")
     check_directory(arguments.output)
@@ -225,7 +233,9 @@ def _check(arguments: argparse.Namespace) -> None:
 def _resumed(arguments: argparse.Namespace, given: _Inputs) -> Stream:
     """The stream of a snapshot, which must have the same preset and camera."""
     with ExitStack() as unless_the_same:
-        stream = unless_the_same.enter_context(Stream.load(arguments.resume, depth=given.depth, masks=given.masks))
+        stream = unless_the_same.enter_context(
+            Stream.load(arguments.resume, depth=given.depth, masks=given.masks, imu=given.imu)
+        )
         if stream.options.preset != arguments.preset:
             raise InputError(
                 f"snapshot {arguments.resume} was made with --preset {stream.options.preset}, not {arguments.preset}"

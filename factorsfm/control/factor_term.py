@@ -1,4 +1,4 @@
-"""Factors of the caller as a term of the polish: on its poses, and on landmarks that are variables of their own.
+"""Factors of the caller as a term of the polish: on its poses and affines, and on landmarks, variables of their own.
 
 The factors are in the world of the live map. The alignment from the world of the polish to that, and the landmarks that
 the factors name, are `State.control` as in `residuals`. The alignment passes through the first camera; its rotation is
@@ -12,14 +12,15 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.adjustment.columns import Columns
 from factorsfm.adjustment.state import State
-from factorsfm.control.residuals import ALIGNMENT, AlignedState, ControlTerm, MarkItem, Place
+from factorsfm.control.residuals import ALIGNMENT, SCALE_STD, AlignedState, ControlTerm, MarkItem, Place
 from factorsfm.graph.factors_on_poses import FactorsOnPoses
 from factorsfm.support.rotations import camera_centers
 
 Array = NDArray[np.float64]
 
-_TURN_STD, SCALE_STD = 0.05, 0.3  # radians, and of the logarithm: from where on the factors know something of it
+_TURN_STD = 0.05  # radians, from where on the factors know something of a turn
 _HELD = 1e12  # information of what is held
 
 
@@ -27,7 +28,7 @@ class FactorTerm:
     """The factors, and the observations of their landmarks, as a term of `BundleAdjustment`.
 
     Args:
-        factors: on all poses of the state, and on the landmarks in the order of `State.control`.
+        factors: on all poses of the state, on the landmarks in the order of `State.control`, and on all its affines.
         marks: observations of these landmarks.
         start: (3, 3) rotation of the alignment; anchor: (3,) its place, see `AlignedState`.
         kernel: of the observations, standard deviations.
@@ -48,10 +49,9 @@ class FactorTerm:
         self._factors = factors
         self._marks = ControlTerm(marks, start, anchor, np.ones(len(state.control), bool), kernel)
         self._held = np.zeros((3, 3))
-        information, _ = self._quadratic(state)
+        information, _ = self._quadratic(state, factors)
         first = self.aligned(state).first
-        size = 1.0 / max(float(information[first + 6, first + 6]), 1e-300)
-        self.determines_scale = bool(size < SCALE_STD**2)
+        self.determines_scale = _knows_scale(information, first)
         known, axes = np.linalg.eigh(information[first : first + 3, first : first + 3])
         held = axes[:, known < _TURN_STD**-2.0]
         self._held = _HELD * held @ held.T
@@ -72,7 +72,7 @@ class FactorTerm:
 
     def add(self, state: State, information: Array, gradient: Array) -> None:
         """Add to the normal equations (c, c) and (c,) of the camera side, see `Columns`."""
-        mine, right = self._quadratic(state)
+        mine, right = self._quadratic(state, self._factors)
         information += mine
         gradient += right
         self._marks.add(state, information, gradient)
@@ -84,24 +84,40 @@ class FactorTerm:
         """Of each factor what it is on, and its error in standard deviations."""
         return self._factors.errors(*self._in_factors_world(state))
 
-    def _in_factors_world(self, state: State) -> tuple[Array, Array, Array]:
-        """Poses (`cam_from_world`) and landmarks in the world of the factors."""
+    def agree_on_scale(self, state: State, agreeing: Sequence[int]) -> bool:
+        """Whether some of the factors, by their numbers, know lengths."""
+        information, _ = self._quadratic(state, self._factors.of(agreeing))
+        return _knows_scale(information, self.aligned(state).first)
+
+    def _in_factors_world(self, state: State) -> tuple[Array, Array, Array, Array]:
+        """Poses (`cam_from_world`), landmarks and affines in the world of the factors."""
         world = self.aligned(state).similarity
         rotation = state.rotation @ world.rotation.T
         centers = world.points(camera_centers(state.rotation, state.translation))
         points = world.points(state.control[ALIGNMENT:].reshape(-1, 3))
-        return rotation, -np.einsum("kij,kj->ki", rotation, centers), points
+        affines = np.column_stack([world.scale * state.scale, state.shift])
+        return rotation, -np.einsum("kij,kj->ki", rotation, centers), points, affines
 
-    def _quadratic(self, state: State) -> tuple[Array, Array]:
-        """The factors alone, by the columns of the adjustment."""
-        aligned = self.aligned(state)
-        by_columns = np.zeros((6 * len(state.rotation) + len(state.control) - ALIGNMENT, aligned.columns.size))
+    def _quadratic(self, state: State, factors: FactorsOnPoses) -> tuple[Array, Array]:
+        """Some factors alone, by the columns of the adjustment."""
+        aligned, columns = self.aligned(state), Columns.of(state)
+        end = 6 * len(state.rotation) + len(state.control) - ALIGNMENT  # of the poses and landmarks
+        by_columns = np.zeros((end + 2 * len(state.scale), columns.size))
         for row in range(len(state.rotation)):
-            columns, by_variables = aligned.known_pose(row)
-            by_columns[6 * row : 6 * row + 6, columns] = by_variables
+            used, by_variables = aligned.known_pose(row)
+            by_columns[6 * row : 6 * row + 6, used] = by_variables
         for row in range((len(state.control) - ALIGNMENT) // 3):
-            _, columns, by_place = aligned.known_place(Place(row))
+            _, used, by_place = aligned.known_place(Place(row))
             begin = 6 * len(state.rotation) + 3 * row
-            by_columns[begin : begin + 3, columns] = by_place
-        information, gradient = self._factors.quadratic(*self._in_factors_world(state))
+            by_columns[begin : begin + 3, used] = by_place
+        by_columns[np.arange(end, end + 2 * len(state.scale)), columns.affines] = np.tile(
+            [aligned.scale, 1.0], len(state.scale)
+        )
+        by_columns[end::2, aligned.scale_column] = aligned.scale * state.scale
+        information, gradient = factors.quadratic(*self._in_factors_world(state))
         return by_columns.T @ information @ by_columns, by_columns.T @ gradient
+
+
+def _knows_scale(information: Array, first: int) -> bool:
+    """Whether the logarithm of the scale is known, where all else is; `first`: column of the alignment."""
+    return bool(1.0 / max(float(information[first + 6, first + 6]), 1e-300) < SCALE_STD**2)

@@ -29,6 +29,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 ALIGNMENT = 7  # variables of the world alignment
+SCALE_STD = 0.3  # of the logarithm of the scale, with which it counts as known
 
 # Residual (d,), the columns that it depends on (c,), and its derivative by these (d, c).
 Linearized = tuple[Array, Index, Array]
@@ -252,6 +253,26 @@ class ControlTerm:
         """Of every item, in standard deviations."""
         aligned = self.aligned(state)
         return [item.linearized(aligned)[0] for item in self.items]
+
+    def knows_scale(self, state: State, items: Sequence[Item]) -> bool:
+        """Whether some of the items determine the scale, where the scene is as it is in its own unit.
+
+        It is known, too, where held poses do not leave it free.
+        """
+        if not self.free[6]:
+            return True
+        aligned = self.aligned(state)
+        information = np.zeros((ALIGNMENT, ALIGNMENT))
+        for item in items:
+            _, columns, derivative = item.linearized(aligned)
+            mine = columns >= aligned.first
+            by_alignment = np.zeros((len(derivative), len(state.control)))
+            by_alignment[:, columns[mine] - aligned.first] = derivative[:, mine]
+            information += by_alignment[:, :ALIGNMENT].T @ by_alignment[:, :ALIGNMENT]
+        others = np.flatnonzero(self.free[: ALIGNMENT - 1])
+        shared = information[others, -1]
+        alone = information[-1, -1] - shared @ np.linalg.pinv(information[np.ix_(others, others)], 1e-9) @ shared
+        return bool(alone * SCALE_STD**2 > 1.0)
 
     def cost(self, state: State) -> float:
         """Robust cost."""

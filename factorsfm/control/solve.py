@@ -58,6 +58,10 @@ class Controlled:
     point_std: Array
     fit: ControlFit
 
+    def without_unit(self) -> Controlled:
+        """The same where nothing that agrees with the images knows lengths."""
+        return replace(self, world_alignment=None, fit=replace(self.fit, placed=False, scale_std=np.inf))
+
 
 def solve_under_control(
     adjustment: BundleAdjustment, located: LocatedControl, marks: Observations, frames: list[int]
@@ -91,12 +95,14 @@ def solve_under_control(
     residuals = _residuals(term, solved.state)
     logger.info("control: %d items, %d contradict", len(residuals), sum(r.contradicts for r in residuals))
     exact = [control.names[row] for row, _ in control.held]
-    return described(
+    controlled = described(
         solved, term,
         lambda scale_std, position_std: ControlFit(
             residuals, exact, control.unused, control.placed, scale_std, position_std
         ),
     )  # fmt: skip
+    agreeing = [item for item, residual in zip(term.items, residuals, strict=True) if not residual.contradicts]
+    return controlled if term.knows_scale(solved.state, agreeing) else controlled.without_unit()
 
 
 def options_under_control(options: PolishOptions) -> PolishOptions:

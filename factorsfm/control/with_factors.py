@@ -12,9 +12,9 @@ from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import Free, Known
 from factorsfm.adjustment.state import State
-from factorsfm.control.factor_term import SCALE_STD, FactorTerm
+from factorsfm.control.factor_term import FactorTerm
 from factorsfm.control.fit import ControlFit, ControlResidual
-from factorsfm.control.residuals import MarkItem, Place
+from factorsfm.control.residuals import SCALE_STD, MarkItem, Place
 from factorsfm.control.solve import KERNEL, Controlled, described, options_under_control
 from factorsfm.control.solved_control import triangulated
 from factorsfm.graph.factors_on_poses import FactorsOnPoses
@@ -31,23 +31,24 @@ class ShotFactors:
     Attributes:
         frames: positions of the frames that they name; tracks: (t,) the landmarks.
         poses: `cam_from_world` rotation and translation in the live map, by position.
-        on_poses: makes them a function of the poses at some positions and of some of the tracks.
+        on_poses: makes them a function of the poses at some positions, of some of the tracks, and of the affines at
+            other positions.
     """
 
     frames: list[int]
     tracks: Index
     poses: dict[int, tuple[Array, Array]]
-    on_poses: Callable[[Sequence[int], Sequence[int]], FactorsOnPoses]
+    on_poses: Callable[[Sequence[int], Sequence[int], Sequence[int]], FactorsOnPoses]
 
 
 def solve_with_factors(
-    adjustment: BundleAdjustment, factors: ShotFactors, marks: Observations, frames: list[int]
+    adjustment: BundleAdjustment, factors: ShotFactors, marks: Observations, frames: list[int], guided: list[int]
 ) -> Controlled:
     """Solve once more, with the factors.
 
     Args:
         adjustment: the free solution; marks: observations of the tracks (rows in `factors.tracks`) in its frames.
-        frames: position of each of its frames in the source.
+        frames: position of each of its frames in the source; guided: of those with an affine.
     """
     state = adjustment.state
     places = triangulated(state, marks, np.bincount(marks.point, minlength=len(factors.tracks)))
@@ -55,7 +56,7 @@ def solve_with_factors(
     marks, places = marks.of(placed), places[placed]
     rotation, anchor, shift, scale = _alignment(state, factors, frames)
     state = replace(state, control=np.concatenate([np.zeros(3), shift, [np.log(scale)], places.ravel()]))
-    on_poses = factors.on_poses(frames, factors.tracks[placed].tolist())
+    on_poses = factors.on_poses(frames, factors.tracks[placed].tolist(), guided)
     term = FactorTerm(on_poses, _items(marks, adjustment.sigma), rotation, anchor, KERNEL, state)
     solved = BundleAdjustment(
         state, adjustment.observations, options_under_control(adjustment.options), adjustment.errors,
@@ -63,12 +64,13 @@ def solve_with_factors(
     )  # fmt: skip
     solved.solve()
     residuals = [ControlResidual.of(name, "sigma", 1.0, error) for name, error in term.errors(solved.state)]
+    unused = [f"what is known of {name}, since the depth of its frame takes no part" for name in on_poses.loose]
     controlled = described(solved, term, lambda scale_std, position_std: ControlFit(
-        residuals, [], [], placed=True, scale_std=scale_std, position_std=position_std, source="factors",
+        residuals, [], unused, placed=True, scale_std=scale_std, position_std=position_std, source="factors",
     ))  # fmt: skip
-    if term.determines_scale and controlled.fit.scale_std < SCALE_STD:
-        return controlled
-    return replace(controlled, world_alignment=None, fit=replace(controlled.fit, placed=False, scale_std=np.inf))
+    agreeing = [row for row, residual in enumerate(residuals) if not residual.contradicts]
+    known = term.determines_scale and controlled.fit.scale_std < SCALE_STD
+    return controlled if known and term.agree_on_scale(solved.state, agreeing) else controlled.without_unit()
 
 
 def _alignment(state: State, factors: ShotFactors, frames: list[int]) -> tuple[Array, Array, Array, float]:

@@ -16,7 +16,14 @@ import numpy as np
 from gtsam.symbol_shorthand import A, L, X
 from numpy.typing import NDArray
 
-from factorsfm.graph.factors import HELD, landmark_prior, native_affine, pose_from_camera, pose_prior
+from factorsfm.graph.factors import (
+    HELD,
+    landmark_prior,
+    native_affine,
+    native_affine_noise,
+    pose_from_camera,
+    pose_prior,
+)
 from factorsfm.graph.keys import keys_of, letter_of, name_of, ordering_of, part_of
 from factorsfm.graph.window import Window
 
@@ -131,10 +138,17 @@ def present_values(keys: Iterable[int], present: MapValues) -> gtsam.Values:
 
 
 def error_of(factor: gtsam.NonlinearFactor, values: gtsam.Values) -> float:
-    """In standard deviations, the root mean square of its rows; of what was linearised, the root of their sum."""
-    # GTSAM crashes where a linearised factor that was read from text is asked for its rows.
-    rows = 1 if isinstance(factor, gtsam.LinearContainerFactor) else max(factor.dim(), 1)
-    return float(np.sqrt(2.0 * max(factor.error(values), 0.0) / rows))
+    """In standard deviations, the root mean square of its rows; of what was linearised, how far it is from its minimum.
+
+    The least cost of what was linearised is that of constants: no variable can lower it.
+    """
+    if isinstance(factor, gtsam.LinearContainerFactor):
+        # GTSAM crashes where one that was read from text is asked for its rows.
+        augmented = factor.linearize(values).augmentedInformation()
+        gradient = augmented[:-1, -1]
+        step = np.linalg.lstsq(augmented[:-1, :-1], gradient)[0]
+        return float(np.sqrt(max(float(gradient @ step), 0.0)))
+    return float(np.sqrt(2.0 * max(factor.error(values), 0.0) / max(factor.dim(), 1)))
 
 
 def misfit_of(added: AddedFactors, estimate: gtsam.Values) -> str:
@@ -215,4 +229,4 @@ def held_prior(key: int, values: gtsam.Values) -> gtsam.NonlinearFactor:
         return pose_prior(key, values.atPose3(key), HELD)
     if letter == "l":
         return landmark_prior(key, values.atPoint3(key), HELD)
-    return gtsam.PriorFactorCal3_S2(key, values.atCal3_S2(key), gtsam.noiseModel.Isotropic.Sigma(5, HELD))
+    return gtsam.PriorFactorCal3_S2(key, values.atCal3_S2(key), native_affine_noise(HELD, HELD))

@@ -189,6 +189,11 @@ def affine_of_native(affine: gtsam.Cal3_S2) -> tuple[float, float]:
     return affine.fx() * VIRTUAL_BASELINE, affine.px()
 
 
+# (5, 2) derivative of `native_affine` by scale and shift.
+NATIVE_BY_AFFINE = np.zeros((5, 2))
+NATIVE_BY_AFFINE[0, 0], NATIVE_BY_AFFINE[3, 1] = 1.0 / VIRTUAL_BASELINE, 1.0
+
+
 def native_affine_noise(scale_sigma: float, shift_sigma: float) -> gtsam.noiseModel.Base:
     """Noise of a prior on a native affine; what has no meaning is pinned."""
     return gtsam.noiseModel.Diagonal.Sigmas(np.array([scale_sigma / VIRTUAL_BASELINE, 1e-6, 1e-6, shift_sigma, 1e-6]))

@@ -43,6 +43,11 @@ class IncrementalMapper:
         self._refine_focal = options.refine_focal_length
 
     @property
+    def refines_focal(self) -> bool:
+        """Whether the focal length is a guess, which the map refines."""
+        return self._refine_focal
+
+    @property
     def registered(self) -> int:
         """Number of images with a pose."""
         return sum(image.registered for image in self.images)
@@ -127,6 +132,7 @@ def triangulate_tracks(
         fallback=fallback,
         affine=affine,
         prior=prior,
+        in_graph=guidance.options.triangulation_depth == "paper",
     )
 
 

@@ -12,6 +12,7 @@ from factorsfm.adjustment.observations import Observations, PriorObservations
 from factorsfm.adjustment.problem import ErrorModel, Free
 from factorsfm.adjustment.residuals import camera_points, reprojection
 from factorsfm.adjustment.state import State
+from factorsfm.graph.points_alone import solve_points
 from factorsfm.support.options import PolishOptions
 
 Array = NDArray[np.float64]
@@ -44,6 +45,7 @@ def triangulate(
     fallback: Array,
     affine: Array | None = None,
     prior: PriorObservations | None = None,
+    in_graph: bool = False,
     seed: int = 0,
 ) -> Triangulation:
     """DLT in RANSAC, then ``min over P of sum E_PR + lambda E_DC`` with cameras and affines fixed (paper, 3.3).
@@ -54,6 +56,7 @@ def triangulate(
         fallback: (n,) inverse distance along the first ray where the views leave it open (small angle).
         affine, prior: (images, 2) scale and shift, and the values they scale; None without a prior.
         inlier_px, sigma: pixels.
+        in_graph: whether GTSAM solves for the points, where there is a prior: the same minimum, in five times the time.
     """
     o, rotation, translation = observations, cameras.rotation, cameras.translation
     start = o.first
@@ -83,8 +86,11 @@ def triangulate(
     state = replace(cameras, bearing=chosen[:, :3] / distance[:, None], inverse_distance=chosen[:, 3] / distance)
     if affine is not None:
         state = replace(state, scale=affine[:, 0], shift=affine[:, 1], field=np.zeros(1))
-    options = replace(PolishOptions(), iterations=8)
-    state = BundleAdjustment(state, o, options, ErrorModel(sigma), prior=prior, free=Free(cameras=False)).solve()
+    if in_graph and prior is not None:
+        state = solve_points(state, o, sigma, prior)
+    else:
+        options = replace(PolishOptions(), iterations=8)
+        state = BundleAdjustment(state, o, options, ErrorModel(sigma), prior=prior, free=Free(cameras=False)).solve()
     error = _support(cameras, o, xy, _homogeneous(state.bearing, state.inverse_distance), inlier_px)
     inliers = np.add.reduceat((error < inlier_px).astype(np.int64), start)
     return Triangulation(state.bearing, state.inverse_distance, inliers, angle)

@@ -54,6 +54,7 @@ def polish(
     groups: Index | None = None,
     control: LocatedControl | None = None,
     factors: ShotFactors | None = None,
+    joining: Callable[[Polished], ShotFactors | None] | None = None,
     first_focal: tuple[Array, float] | None = None,
     recording: Recording | None = None,
     suspects: Index | None = None,
@@ -72,6 +73,7 @@ def polish(
         suspects: ids (ascending) of tracks that count only where they agree with the others.
         control: known poses, points and lengths; it takes part at the end, and only where the camera moves.
         factors: of the caller, where there is no control; they take part as it does.
+        joining: gives factors by the poses that images and prior alone show, where there are none before.
 
     Raises:
         ReconstructionError: hardly any tracks are left that connect frames, or the control does not determine where its
@@ -85,6 +87,8 @@ def polish(
     if control is not None and start.core.motion.kind is ShotKind.GENERAL:
         progress("polish: control")
         _put_under_control(result, adjustment, control, shot)
+    if joining is not None and start.core.motion.kind is ShotKind.GENERAL:
+        factors = joining(result)
     if factors is not None and start.core.motion.kind is ShotKind.GENERAL:
         progress("polish: factors")
         _respect_factors(result, adjustment, factors, shot)
@@ -230,7 +234,9 @@ def _put_under_control(result: Polished, adjustment: BundleAdjustment, control: 
 def _respect_factors(result: Polished, adjustment: BundleAdjustment, factors: ShotFactors, shot: Shot) -> None:
     """Everything as it is with the factors; the observability stays that of images and prior."""
     marks = shot.observations(result.frames, factors.tracks)
-    _take_over(result, solve_with_factors(adjustment, factors, marks, result.frames))
+    guided = [] if result.prior is None else [result.frames[row] for row in result.prior.images]
+    _take_over(result, solve_with_factors(adjustment, factors, marks, result.frames, guided))
+    result.factors = factors
 
 
 def _take_over(result: Polished, found: Controlled) -> None:

@@ -12,6 +12,7 @@ from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.prior_term import PriorPart
 from factorsfm.adjustment.state import State
 from factorsfm.control.fit import ControlFit
+from factorsfm.control.with_factors import ShotFactors
 from factorsfm.lens.lens import LensEstimate
 from factorsfm.lens.rolling_shutter import Shutter
 from factorsfm.motion.at_rest import Rest
@@ -50,6 +51,7 @@ class Polished:
         inflation: of the variance of the core tracks, since errors of neighbours are alike, see `error_inflation`.
         contradiction: see `NearAndFar.correlation`.
         world_alignment: from this world to that of the control; control: its residuals. None without control.
+        factors: of the caller, that took part.
         unused: "Control" or "Factors added", where there are some that could not take part.
     """
 
@@ -81,6 +83,7 @@ class Polished:
     contradiction: float | None = None
     world_alignment: Similarity | None = None
     control: ControlFit | None = None
+    factors: ShotFactors | None = None
     unused: str = ""
 
     def describe_prior(self, adjustment: BundleAdjustment, camera_covariance: Array) -> None:

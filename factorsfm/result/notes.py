@@ -187,9 +187,12 @@ def control_notes(fit: ControlFit) -> list[str]:
     good = [r.sigmas for r in fit.residuals if not r.contradicts]
     size = f", off by {np.sqrt(np.mean(np.square(good))):.2g} sigma (root mean square)" if good else ""
     held = f"{len(fit.held)} poses held exactly, " if fit.held else ""
-    what, item, world = "Control", "items of the control", "The world is that of the first camera."
+    what, whole, item, world = (
+        "Control", "the control", "items of the control", "The world is that of the first camera.",
+    )  # fmt: skip
     if fit.source == "factors":
-        what, item, world = "Factors added", "factors", "The result is in the world of the live graph."
+        what, whole, item = "Factors added", "the factors added", "factors"
+        world = "The result is in the world of the live graph."
     elif fit.placed:
         world = "The result is in the control's world."
     scale, position = f"{100 * fit.scale_std:.2g} %", f"{fit.position_std:.2g} m"
@@ -203,7 +206,7 @@ def control_notes(fit: ControlFit) -> list[str]:
         said = "; ".join(f"{r.name} by {size}{r.sigmas:.0f} sigma" for r, size in zip(worst, sizes, strict=True))
         notes.append(f"{len(wrong)} {item} contradict the images and the others: {said}.")
     if fit.unused:
-        notes.append(f"Not used of the control: {'; '.join(fit.unused[:3])}.")
+        notes.append(f"Not used of {whole}: {'; '.join(fit.unused[:3])}.")
     return notes
 
 

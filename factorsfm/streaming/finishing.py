@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from factorsfm.camera.guess import first_focal_std
 from factorsfm.control.known import Control, LocatedControl, locate
 from factorsfm.control.with_factors import ShotFactors
+from factorsfm.graph.added_factors import AddedFactors
 from factorsfm.graph.factors_on_poses import FactorsOnPoses
 from factorsfm.lens.camera_model import distortion_of
 from factorsfm.lens.rolling_shutter import Recording
@@ -24,11 +25,13 @@ from factorsfm.result.reconstruction import Reconstruction
 from factorsfm.streaming.footage import Footage
 from factorsfm.streaming.frame_update import SeenFrame
 from factorsfm.streaming.imu_result import add_imu
-from factorsfm.streaming.imu_source import ImuSource
+from factorsfm.streaming.imu_source import FramePoses, ImuSource
 from factorsfm.support.errors import ReconstructionError
 from factorsfm.support.options import Options
 from factorsfm.support.progress import Progress
 from factorsfm.support.stages import StageSeconds
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,8 +97,10 @@ class EndedShot:
             count, first = len(self.without_depth), next(iter(self.without_depth.values()))
             result.notes.append(f"Frames that went without depth because the prior failed: {count}; {first}.")
         if self.imu is not None:
-            on_poses = None if factors is None else factors.on_poses(polished.frames, [])
-            add_imu(result, self.imu, on_poses, lens_given=self.lens_given)
+            took_part = polished.factors
+            on_poses = None if took_part is None else took_part.on_poses(polished.frames, [], [])
+            focal_std = 0.0 if polished.lens is None else float(polished.lens.focal_std.max())
+            add_imu(result, self.imu, on_poses, focal_std)
         if self.mapper.without_prior:
             result.notes.append(f"The map went on without the depth prior: {self.mapper.without_prior}.")
         return result
@@ -112,6 +117,7 @@ class EndedShot:
             distortion_of(self.camera) if self.options.estimates_lens else None,
             control=control,
             factors=factors,
+            joining=self._imu_joining if factors is None and self.imu is not None else None,
             first_focal=(np.array([self.mapper.first_focal]), first_focal_std(self.camera, given=self.lens_given)),
             recording=self._recording(),
             suspects=self.suspects,
@@ -128,19 +134,40 @@ class EndedShot:
 
     def _factors(self) -> ShotFactors | None:
         """Those that were added to the live graph, with the poses that these are beside."""
-        added, contents = self.mapper.additions.everything(), self.mapper.contents()
+        added = self.mapper.additions.everything()
         if not added.numbers:
             return None
-        images = [image for image in self.mapper.images if image.registered]
-        frame_of = {image.tracks.position: image.tracks.frame for image in images}
+        return self._beside(
+            added, {image.tracks.position: image.pose for image in self.mapper.images if image.registered}
+        )
+
+    def _beside(self, added: AddedFactors, poses: dict[int, tuple[Array, Array]]) -> ShotFactors:
+        """Factors in the world of some poses, which are there by position."""
+        numbers, contents = [image.tracks.frame for image in self.mapper.images], self.mapper.contents()
         return ShotFactors(
-            frames=[position for position, frame in frame_of.items() if frame in added.frames],
+            frames=[position for position in poses if numbers[position] in added.frames],
             tracks=np.array(sorted(added.tracks), np.int64),
-            poses={image.tracks.position: image.pose for image in images},
-            on_poses=lambda positions, tracks: FactorsOnPoses(
-                added, contents, [frame_of[position] for position in positions], tracks
+            poses=poses,
+            on_poses=lambda positions, tracks, guided: FactorsOnPoses(
+                added, contents, [numbers[k] for k in positions], tracks, [numbers[k] for k in guided]
             ),
         )
+
+    def _imu_joining(self, polished: Polished) -> ShotFactors | None:
+        """Those of an IMU that could not join the live graph, in metres and in the world of the polished poses."""
+        assert self.imu is not None
+        if self.mapper.refines_focal and (polished.lens is None or not polished.lens.determined):
+            self.imu.reason = "the lens is not known, and the shot does not determine it"
+            return None
+        images, rows = self.mapper.images, polished.frames
+        poses = FramePoses.none(len(images))
+        poses.rotation[rows], poses.translation[rows] = polished.state.rotation, polished.state.translation
+        poses.covariance[rows] = polished.covariance
+        if (found := self.imu.join(poses, [image.tracks.frame for image in images])) is None:
+            return None
+        (graph, values), scale = found
+        added = AddedFactors.of(range(graph.size()), graph, values)
+        return self._beside(added, {k: (poses.rotation[k], scale * poses.translation[k]) for k in rows})
 
     def _located_control(self) -> LocatedControl | None:
         if self.control is None:

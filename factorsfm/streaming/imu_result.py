@@ -25,16 +25,18 @@ _LONGEST_GAP = 3.0  # seconds
 _LARGEST_ROTATION_STD = np.radians(3.0)
 
 
-def add_imu(result: Reconstruction, imu: ImuSource, factors: FactorsOnPoses | None, *, lens_given: bool) -> None:
+def add_imu(result: Reconstruction, imu: ImuSource, factors: FactorsOnPoses | None, focal_std: float) -> None:
     """Give a result what the IMU says of it, and a note.
 
     Args:
-        factors: on the poses of the result, None where the IMU took no part; lens_given: whether the lens was known.
+        factors: on the poses of the result, None where the IMU took no part.
+        focal_std: relative standard deviation of the focal length, by which lengths may be off; 0 where it is known.
     """
     if factors is None or not imu.takes_part or imu.timing is None or result.control is None or not result.metric:
         open_unit = "the camera does not move" if result.control is None else "it leaves the unit of length open"
-        lens = "" if lens_given else "; the camera was not given, and the IMU needs its focal length from the start"
-        result.notes.append(f"IMU: it takes no part: {imu.reason or open_unit}{lens}.")
+        if result.control is not None and any(residual.contradicts for residual in result.control.residuals):
+            open_unit = "its factors contradict the images"
+        result.notes.append(f"IMU: it takes no part: {imu.reason or open_unit}.")
         return
     registered = {frame.index: frame for frame in result.registered}
     state, up_std = posterior_state(factors, {i: (_pose(f), f.covariance) for i, f in registered.items()})
@@ -43,7 +45,7 @@ def add_imu(result: Reconstruction, imu: ImuSource, factors: FactorsOnPoses | No
     result.imu = ImuFit(
         up=(-state.gravity / np.linalg.norm(state.gravity)).tolist(),
         up_std=float(np.degrees(np.hypot(up_std, timing.rotation_sigma))),
-        scale_std=float(np.hypot(result.control.scale_std, imu.recording.noise.accelerometer_scale)),
+        scale_std=float(np.linalg.norm([result.control.scale_std, imu.recording.noise.accelerometer_scale, focal_std])),
         cam_from_imu=timing.cam_from_imu.tolist(),
         rotation_std=float(np.degrees(timing.rotation_sigma)),
         time_offset=timing.time_offset,

@@ -41,7 +41,7 @@ from factorsfm.streaming.frame_update import (
     mark_blank,
     pose_of,
 )
-from factorsfm.streaming.imu_source import ImuSource
+from factorsfm.streaming.imu_source import ImuSource, restore_imu
 from factorsfm.streaming.snapshot import read_snapshot, write_snapshot
 from factorsfm.streaming.suspicion import Suspicion
 from factorsfm.streaming.view_finder import ViewFinder
@@ -280,7 +280,7 @@ class Stream(Closing):
             path: of the snapshot; depth, masks, imu: the priors and the recording that the stream had.
 
         Raises:
-            InputError: the file cannot be read, is torn, or is no snapshot; the stream had an IMU and none is given.
+            InputError: the file cannot be read, is torn, or is no snapshot; an IMU is missing, or the stream had none.
         """
         state = read_snapshot(Path(path))
         try:
@@ -308,10 +308,7 @@ class Stream(Closing):
             self._mapper.restore(state["mapper"])
             self._indices = FrameIndices(image.tracks.frame for image in self._mapper.images)
         self._suspicion.restore(state["suspicion"])
-        if state["imu"] is not None:
-            if self._imu is None:
-                raise InputError("the snapshot is of a stream with an IMU; its recording must be given, too")
-            self._imu.restore(state["imu"])
+        restore_imu(self._imu, state["imu"])
 
     def finish(self, progress: Progress | None = None) -> Reconstruction:
         """Polish over all frames and tracks.

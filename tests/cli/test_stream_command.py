@@ -17,6 +17,7 @@ import factorsfm
 from factorsfm.camera.files import camera_to_json
 from factorsfm.cli.main import main
 from tests.command_line import assert_error, trajectory
+from tests.instruments import CHECKS, write_walk
 from tests.rendered import FRAMES, quick_presets, rendered, simulated_maps
 
 Run = Callable[..., int]
@@ -300,3 +301,39 @@ def test_killed_it_goes_on_from_the_last_snapshot(tmp_path: Path, given: list[st
     assert main([*command, "--resume", str(snapshot)]) == 0
     assert main(["reconstruct", str(folder), "--output", str(tmp_path / "once"), *given]) == 0
     np.testing.assert_allclose(trajectory(tmp_path / "out"), trajectory(tmp_path / "once"), rtol=0.0, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_an_imu_beside_a_stream_and_a_snapshot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_walk(tmp_path)
+    given = ["--camera", tmp_path / "walk.json", "--depth", "none", "--imu", tmp_path / "imu.csv"]
+
+    def run(output: str, *more: object) -> int:
+        return main([*map(str, ["stream", tmp_path / "walk.mp4", "--output", tmp_path / output, *given, *more])])
+
+    assert run("part", "--frames", "0:90", "--snapshot", tmp_path / "state") == 0
+    assert run("out", "--resume", tmp_path / "state") == 0
+    assert 0.004 < summary(tmp_path / "out")["imu"]["scale_std"] < 0.012
+    CHECKS["walk.mp4"]({"reconstruction": factorsfm.read_result(tmp_path / "out")}, rendered("dolly"))
+    capsys.readouterr()
+    given = given[:-2]
+    assert run("none", "--resume", tmp_path / "state") == 2
+    assert_error(capsys.readouterr(), "the snapshot is of a stream with an IMU; its recording must be given, too")
+
+
+def test_what_an_imu_needs_of_a_stream(tmp_path: Path, stream: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    samples = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, -9.81, 0.0], (200, 1))
+    samples[:, 0] = np.arange(200) / 200
+    names = "time,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z"
+    np.savetxt(tmp_path / "imu.csv", samples, delimiter=",", header=names, comments="")
+    imu = ["--imu", tmp_path / "imu.csv"]
+    assert stream("--imu", tmp_path / "other.csv") == 2
+    assert_error(capsys.readouterr(), "other.csv")
+    assert stream(*imu) == 2
+    assert_error(capsys.readouterr(), "frame 0 has no time; an IMU needs those of all frames")
+    assert stream(*imu, "--cuts") == 2
+    assert_error(capsys.readouterr(), "--cuts cannot be combined with --imu")
+    assert stream("--snapshot", tmp_path / "state", "--frames", "0:3") == 0
+    capsys.readouterr()
+    assert stream(*imu, "--resume", tmp_path / "state") == 2
+    assert_error(capsys.readouterr(), "the snapshot is of a stream without an IMU; a recording cannot join it")

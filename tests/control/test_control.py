@@ -296,6 +296,22 @@ def test_a_distance_alone_gives_the_scale(exact: Problem) -> None:
     assert not result.control.placed
 
 
+def test_distances_of_which_none_agrees_leave_the_unit_open(exact: Problem) -> None:
+    """Between the same cameras, one half as long again as the other; one is right where there is a third beside it."""
+    length = float(np.linalg.norm(true_centers(exact)[0] - true_centers(exact)[9]))
+    known = [KnownDistance(k * length, 1e-3 * length, (10, 19)) for k in (1.0, 1.5)]
+    result = solve(exact, Control(distances=known))
+    assert result.control is not None
+    assert [r.contradicts for r in result.control.residuals] == [True, True]
+    assert (result.world_alignment, result.control.scale_std) == (None, np.inf)
+    near = float(np.linalg.norm(true_centers(exact)[0] - true_centers(exact)[5]))
+    result = solve(exact, Control(distances=[*known, KnownDistance(near, 1e-3 * near, (10, 15))]))
+    assert result.control is not None
+    assert [r.contradicts for r in result.control.residuals] == [False, True, False]
+    assert result.world_alignment is not None
+    assert result.world_alignment.scale == pytest.approx(WORLD.scale * unit_of(result, exact), rel=1e-3)
+
+
 def test_noise_of_the_control_shows_in_the_scale_as_foretold() -> None:
     """Errors of the scale and of cameras in their standard deviations; the robust weights err on the safe side."""
     scales: list[tuple[float, int]] = []

@@ -6,9 +6,9 @@ import pytest
 from gtsam.symbol_shorthand import A, B, L, P, V, X
 
 from factorsfm import InputError
-from factorsfm.graph.added_factors import NOTHING_ADDED, AddedFactors, condensed, held_prior
+from factorsfm.graph.added_factors import NOTHING_ADDED, AddedFactors, condensed, error_of, held_prior
 from factorsfm.graph.factor_checks import checked_factors
-from factorsfm.graph.factors import HELD, camera_from_pose
+from factorsfm.graph.factors import HELD, NATIVE_BY_AFFINE, camera_from_pose, native_affine, native_affine_noise
 from factorsfm.graph.factors_on_poses import FactorsOnPoses
 from factorsfm.graph.keys import part_of
 from factorsfm.graph.unit_of_length import unit_of_length
@@ -37,6 +37,27 @@ class Contents:
 
     def landmark(self, track):
         return self.points.get(track)
+
+
+def test_constants_that_contradict_each_other_are_no_error_of_what_is_condensed():
+    """Of two measurements of one variable, 60 standard deviations apart, no value of it can meet more than the mean."""
+
+    def along(x):
+        return gtsam.Pose3(gtsam.Rot3(), np.array([x, 0.0, 0.0]))
+
+    graph = graph_of(*(gtsam.BetweenFactorPose3(X(k), P(1), along(0.6 * k), NOISE) for k in range(2)))
+    graph.add(gtsam.BetweenFactorPose3(P(1), P(0), along(0.0), gtsam.noiseModel.Isotropic.Sigma(6, 0.01 / 2**0.5)))
+    graph.add(gtsam.BetweenFactorPose3(P(0), X(2), along(0.0), NOISE))
+    constants = gtsam.Values()
+    for k in range(2):
+        constants.insert(X(k), gtsam.Pose3())
+    own = values_of(p0=along(0.3))
+    own.insert(P(1), along(0.3))
+    short = condensed(AddedFactors.of(range(4), graph, own), {X(2)}, constants).graph()
+    (linear,) = (f for f in map(short.at, range(short.size())) if isinstance(f, gtsam.LinearContainerFactor))
+    assert 2.0 * linear.error(values_of(p0=along(0.3))) == pytest.approx(2 * 30.0**2, rel=1e-3)
+    for x, expected in ((0.3, 0.0), (0.31, 1.0)):  # with the noise of the mean and that of the last step
+        assert error_of(linear, values_of(p0=along(x))) == pytest.approx(expected, abs=1e-3)
 
 
 def graph_of(*factors):
@@ -262,15 +283,18 @@ def test_the_quadratic_has_the_gradient_and_the_curvature_of_the_least_cost():
     points = np.array([truth.points[7] + [1e-3, 0, 0]])
     graph = chain(truth).graph()
     graph.add(gtsam.RangeFactor3D(X(1), L(7), 4.0, gtsam.noiseModel.Isotropic.Sigma(1, 0.01)))
+    graph.add(gtsam.PriorFactorCal3_S2(A(2), native_affine(1.1, 0.2), native_affine_noise(0.02, 0.05)))
     added = AddedFactors.of(range(graph.size()), graph, chain(truth).values())
-    on_poses = FactorsOnPoses(added, truth, range(FRAMES), [7])
+    on_poses = FactorsOnPoses(added, truth, range(FRAMES), [7], [2, 4])
+    assert on_poses.loose == []
 
     def at(step):
         poses = [pose.retract(step[6 * k : 6 * k + 6]) for k, pose in enumerate(off)]
         cameras = [camera_from_pose(pose) for pose in poses]
-        return np.array([r for r, _ in cameras]), np.array([t for _, t in cameras]), points + step[-3:]
+        affines = np.array([[1.0, 0.1], [0.7, 0.0]]) + step[-4:].reshape(2, 2)
+        return np.array([r for r, _ in cameras]), np.array([t for _, t in cameras]), points + step[-7:-4], affines
 
-    size, step = 6 * FRAMES + 3, 1e-5
+    size, step = 6 * FRAMES + 3 + 4, 1e-5
     information, gradient = on_poses.quadratic(*at(np.zeros(size)))
     numeric = np.array(
         [(on_poses.cost(*at(step * e)) - on_poses.cost(*at(-step * e))) / (2 * step) for e in np.eye(size)]
@@ -281,7 +305,14 @@ def test_the_quadratic_has_the_gradient_and_the_curvature_of_the_least_cost():
     along = [on_poses.cost(*at(s * direction)) for s in (-1e-3, 0.0, 1e-3)]
     curvature = (along[0] - 2 * along[1] + along[2]) / 1e-6
     assert direction @ information @ direction == pytest.approx(curvature, rel=2e-2)
+    assert information[-4, -4] == pytest.approx(0.02**-2)
+    assert gradient[-4:] == pytest.approx([-0.1 / 0.02**2, -0.1 / 0.05**2, 0.0, 0.0])
     names = dict(on_poses.errors(*at(np.zeros(size))))
+    assert names["PriorFactorCal3_S2 on a2"] == pytest.approx(np.sqrt((5.0**2 + 2.0**2) / 5), rel=1e-6)
+    chosen = on_poses.of([graph.size() - 1])
+    assert chosen.errors(*at(np.zeros(size))) == [("PriorFactorCal3_S2 on a2", pytest.approx(np.sqrt(29 / 5)))]
+    assert not chosen.quadratic(*at(np.zeros(size)))[0][:-4].any()
+    assert FactorsOnPoses(added, truth, range(FRAMES), [7], [4]).loose == ["a2"]
     assert names["BetweenFactorPose3 on x0, x1"] == pytest.approx(
         np.sqrt(2 * graph.at(0).error(values_of_poses(off)) / 6), rel=1e-6
     )
@@ -302,4 +333,6 @@ def test_held_priors_hold():
     for key in (X(0), L(0), A(0)):
         graph = graph_of(held_prior(key, values))
         covariance = gtsam.Marginals(graph, values).marginalCovariance(key)
-        np.testing.assert_allclose(np.sqrt(np.diag(covariance)), HELD, rtol=1e-6)
+        by = NATIVE_BY_AFFINE if key == A(0) else np.eye(len(covariance))  # the scale of an affine is what is held
+        held = np.linalg.pinv(by) @ covariance @ np.linalg.pinv(by).T
+        np.testing.assert_allclose(np.sqrt(np.diag(held)), HELD, rtol=1e-6)

@@ -163,3 +163,16 @@ def test_the_same_seed_gives_the_same_points():
     problem = make_problem("handheld", noise_px=1.0)
     first, again = run(problem, seed=3), run(problem, seed=3)
     np.testing.assert_array_equal(first.inverse_distance, again.inverse_distance)
+
+
+@pytest.mark.parametrize("motion", ["dolly", "truck", "handheld", "static"])
+def test_the_graph_gives_the_same_points(motion):
+    """Between noisy rays and a prior that is off; without parallax it is the prior that decides."""
+    problem = make_problem(motion, parallax=0.1, noise_px=0.3) if motion != "static" else make_problem(motion)
+    affine, prior = prior_of(problem, [0, 4], sigma=0.05)
+    prior.inverse_depth[:] *= np.random.default_rng(0).normal(1.0, 0.03, len(prior.inverse_depth))
+    alone, by_graph = (run(problem, affine=affine, prior=prior, in_graph=in_graph) for in_graph in (False, True))
+    apart = np.linalg.norm(points_of(alone) - points_of(by_graph), axis=1) / np.linalg.norm(points_of(alone), axis=1)
+    assert np.median(apart) < 3e-4
+    assert np.quantile(apart, 0.95) < 3e-3  # the weak priors of the two differ
+    np.testing.assert_array_equal(alone.inliers, by_graph.inliers)

@@ -8,9 +8,10 @@ from functools import cache
 import gtsam
 import numpy as np
 import pytest
-from gtsam.symbol_shorthand import L, P, X
+from gtsam.symbol_shorthand import A, L, P, X
 
 from factorsfm import Control, Frame, InputError, KnownDistance, Stream, read_result
+from factorsfm.graph.factors import VIRTUAL_BASELINE, native_affine_noise
 from factorsfm.support.similarity import pose_arrays
 from factorsfm.synthetic import RenderedShot, render_shot
 from tests.rendered import Maps, rendered, simulated_maps
@@ -290,6 +291,58 @@ def test_what_tells_no_length_leaves_the_unit_open(stream, length, tmp_path):
     assert any(note.endswith("; they leave the unit of length open.") for note in result.notes)
     result.write(tmp_path / "out")
     assert not np.isfinite(read_result(tmp_path / "out").control.scale_std)
+
+
+def test_lengths_of_which_none_agrees_leave_the_unit_open(stream):
+    """Two ranges, one twice as long as the other: both are flagged, and what is between them is no metre."""
+    shot = rendered("truck")
+    for image in shot.images:
+        stream.push(image, keyframe=True)
+    stream.trajectory()
+    length = float(np.linalg.norm(metric(shot, 0).between(metric(shot, 7)).translation()))
+    graph, tight = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.Isotropic.Sigma(1, 1e-3)
+    loose = gtsam.noiseModel.Diagonal.Sigmas(np.array([0.1] * 3 + [1e6] * 3))
+    graph.add(gtsam.RangeFactorPose3(X(0), X(7), length, tight))
+    graph.add(gtsam.RangeFactorPose3(X(0), X(7), 2.0 * length, tight))
+    graph.add(gtsam.BetweenFactorPose3(X(1), X(4), metric(shot, 1).between(metric(shot, 4)), loose))
+    stream.add_factors(graph, gtsam.Values())
+    result = stream.finish()
+    assert [r.contradicts for r in result.control.residuals] == [True, True, False]
+    assert (result.metric, result.control.scale_std) == (False, np.inf)
+    (note,) = (note for note in result.notes if note.startswith("Factors added: 1 items used"))
+    assert note.endswith("; they leave the unit of length open.")
+    assert any(note.startswith("2 factors contradict the images and the others: RangeFactor") for note in result.notes)
+
+
+def affine_in_metres(shot: RenderedShot, k: int) -> tuple[float, float]:
+    """Scale and shift of a simulated map, by the true depths."""
+    predicted = 1.0 / (METRES * shot.depths[k].ravel())
+    design = np.column_stack([predicted, np.ones_like(predicted)])
+    scale, shift = np.linalg.lstsq(design, simulated_maps("truck")[k].ravel(), rcond=None)[0]
+    return float(scale), float(shift)
+
+
+def test_the_polish_hears_what_is_known_of_an_affine(stream):
+    """The scale of one map in metres: the unit of the result follows it."""
+    shot = rendered("truck")
+    for image in shot.images:
+        stream.push(image, keyframe=True)
+    stream.trajectory()
+    unit = stream._mapper.images[3].tracks.depth.unit  # what the graph has the values of this map in
+    scale, shift = (value / unit for value in affine_in_metres(shot, 3))
+    known = gtsam.Cal3_S2(scale / VIRTUAL_BASELINE, 1.0, 0.0, shift, 0.0)
+    graph = gtsam.NonlinearFactorGraph()
+    graph.add(gtsam.PriorFactorCal3_S2(A(3), known, native_affine_noise(0.02 * scale, 0.1)))
+    stream.add_factors(graph, gtsam.Values())
+    result = stream.finish()
+    assert result.metric
+    assert [r.name for r in result.control.residuals] == ["PriorFactorCal3_S2 on a3"]
+    assert result.control.residuals[0].sigmas < 1.0
+    assert result.frames[3].prior.scale == pytest.approx(unit * scale, rel=0.02)
+    centers, true = result.camera_centers(), metric(shot, 0).between(metric(shot, 7)).translation()
+    length = np.linalg.norm(centers[-1] - centers[0])
+    assert length == pytest.approx(np.linalg.norm(true), rel=4 * result.control.scale_std)
+    assert 0.008 < result.control.scale_std < 0.05
 
 
 def test_variables_are_named_by_the_index_of_the_frame():

@@ -176,6 +176,26 @@ def test_clocks_are_told_in_a_fitting_unit(offset, said):
 
 
 @pytest.mark.slow
+def test_with_an_unknown_lens_the_imu_joins_the_polish():
+    """Lens, clock and axes unknown; lengths within 2 %."""
+    true_rotations, true_centers = truth()
+    with Stream(imu=unknown(recording())) as stream:
+        for frame in frames():
+            stream.push(frame)
+        assert stream._imu.reason == "the lens is not known while frames arrive"
+        result = stream.finish()
+    assert result.metric
+    rotations, centers = pose_arrays([frame.cam_from_world for frame in result.frames])
+    found, true = in_first_camera(centers, rotations[0]), in_first_camera(true_centers, true_rotations[0])
+    scale = np.sum(found * true) / np.sum(true**2)
+    assert abs(scale - 1.0) < 0.02
+    assert 0.004 < result.imu.scale_std < 0.02
+    assert result.imu.time_offset == pytest.approx(OFFSET, abs=1e-3)
+    up = rotations[0] @ true_rotations[0].T @ -DOWN
+    assert np.degrees(np.arccos(min(1.0, up @ result.imu.up))) < 1.0
+
+
+@pytest.mark.slow
 def test_a_recording_of_something_else_is_refused_with_numbers():
     other = unknown(recording(handheld_path(SECONDS + 0.5, 78), 5))
     result = reconstruct(frames(), camera=CAMERA, depth=None, imu=other)
@@ -225,8 +245,8 @@ def test_attempts_that_fail_become_rarer(monkeypatch):
         raise ReconstructionError("it does not fit")
 
     monkeypatch.setattr(imu_source, "fit_timing", fails)
-    source, mapper = ImuSource(recording()), SimpleNamespace(starts_anew=False, keyframes=[], images=[])
-    mapper.started = True
+    source = ImuSource(recording())
+    mapper = SimpleNamespace(starts_anew=False, keyframes=[], images=[], refines_focal=False, started=True)
     for k in range(1200):
         mapper.keyframes.append(k)
         source.follow(mapper, k / 2)
