@@ -13,7 +13,7 @@ from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.objects.growth import grown
 from factorsfm.objects.object_result import ObjectFrame, ObjectResult
 from factorsfm.objects.scale import PriorOnScene, Scale, scale_from_prior
-from factorsfm.objects.start import LEAST_TRACKS, object_start
+from factorsfm.objects.start import LEAST_FRAMES, LEAST_TRACKS, object_start
 from factorsfm.polish.polish import polish
 from factorsfm.polish.polished import Polished
 from factorsfm.support.errors import ReconstructionError
@@ -24,7 +24,6 @@ from factorsfm.tracks.image_tracks import ImageTracks, seen_by
 
 Array = NDArray[np.float64]
 
-_LEAST_FRAMES = 5
 # On rendered boxes: with 5.6 pixels of perspective and more all starts are right, by margins of 31 and more. With up to
 # 4.7, one in three is wrong, by margins of up to 77.
 _LEAST_PERSPECTIVE_PX, _LEAST_MARGIN = 5.2, 25.0
@@ -68,9 +67,9 @@ def solve_object(
         ReconstructionError: it cannot be solved; the message says why.
     """
     images = [image for image in images if image.position in cameras and len(image.ids) >= LEAST_TRACKS]
-    if len(images) < _LEAST_FRAMES:
+    if len(images) < LEAST_FRAMES:
         raise ReconstructionError(
-            f"{len(images)} frames have {LEAST_TRACKS} tracks on it, at least {_LEAST_FRAMES} needed"
+            f"{len(images)} frames have {LEAST_TRACKS} tracks on it, at least {LEAST_FRAMES} needed"
         )
     turns = np.array([cameras[image.position].cam_from_world.rotation.matrix() for image in images])
     start = object_start(images, turns, options.polish)

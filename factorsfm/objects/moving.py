@@ -1,0 +1,205 @@
+"""What moves by itself without masks: tracks that the scene does not explain, divided into things.
+
+A track that no point at rest explains, before the cameras of the scene, moves by itself, or slides. Neighbours that
+keep beside each other while the scene passes are on the same thing; what slides keeps beside nothing. Whether a thing
+is rigid, and large enough, its solution shows.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
+from factorsfm.adjustment.gather import gather
+from factorsfm.adjustment.noise import FIRST_SIGMA_PX
+from factorsfm.adjustment.observations import Observations
+from factorsfm.adjustment.problem import ErrorModel, Free
+from factorsfm.adjustment.state import State
+from factorsfm.frames.frame import Frame
+from factorsfm.mapping.all_points import triangulated
+from factorsfm.motion.moving import center_and_spread, log_errors
+from factorsfm.objects.start import LEAST_FRAMES, LEAST_TRACKS
+from factorsfm.support.components import connected_components
+from factorsfm.support.options import Options, PolishOptions
+from factorsfm.tracks.image_tracks import ImageTracks, seen_by
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+logger = logging.getLogger(__name__)
+
+_ITERATIONS = 4  # of points alone, until they show what fits the cameras
+_MOMENTS = 24  # of the shot, in which neighbours are looked for
+_NEIGHBOURS, _REACH = 6, 0.08  # of a track in such a moment, within a share of the image's width
+# Of what moves two neighbours against the scene: what they may move against each other. On rendered boxes 97 to 100 %
+# of the tracks of a thing are then on it; with twice as much, 84 %: what is beside it follows it along its outline.
+_TOGETHER = 0.25
+_MASK_WIDTH = 320  # pixels: an outline between tracks is no finer
+
+
+@dataclass(frozen=True, slots=True)
+class MovingThings:
+    """Things that move by themselves, large enough that they may be solved; as `ObjectMasks`.
+
+    Attributes:
+        places: by name, and by index of the frame, (n, 2) pixels of the tracks on each; largest first.
+        loose: number of tracks that move by themselves besides.
+        window_px: side of the windows of the tracks, which lie on the things.
+        name: of this source of masks.
+    """
+
+    places: dict[str, dict[int, Array]]
+    loose: int
+    window_px: int
+    name: str = "auto"
+
+    def __call__(self, frame: Frame) -> dict[str, Flags]:
+        """The windows of the tracks of each thing, and what lies between, at most `_REACH` from one to the next."""
+        return {
+            name: _between(seen[frame.index], frame.image.shape, self.window_px)
+            for name, seen in self.places.items()
+            if frame.index in seen
+        }
+
+    def described(self) -> list[str]:
+        """Of each thing: its name, when it is seen, and where in the middle of that time."""
+        return [f"{name} ({_where(seen)})" for name, seen in self.places.items()]
+
+
+def moving_things(
+    images: Sequence[ImageTracks],
+    cam_from_world: Mapping[int, pycolmap.Rigid3d],
+    scene: Index,
+    options: Options,
+) -> MovingThings:
+    """What moves by itself in a shot whose scene is solved.
+
+    Args:
+        images: of the whole shot, with the scene's lens; their `index` is that of the frame in its source.
+        cam_from_world: of the scene, by position of the image; scene: ids of the tracks of its points.
+    """
+    images = [image for image in images if image.position in cam_from_world]
+    ids = seen_by(images, options.polish.min_track_length) if images else np.zeros(0, np.int64)
+    none = MovingThings({}, 0, options.tracker.window_px)
+    if not len(ids):
+        return none
+    observations = gather(images, ids, np.array([image.camera.mean_focal_length() for image in images]))
+    errors = _errors_at_rest(images, observations, cam_from_world, options.polish)
+    moving = np.flatnonzero(_moves(observations, errors, np.isin(ids, scene), options.polish))
+    if not len(moving):
+        return none
+    o = observations.of(moving)
+    typical = np.sqrt(observations.mean_by_point(errors**2))[moving]
+    label = connected_components(len(moving), _links(o, typical, images[0].camera.width))
+    groups = [np.flatnonzero(label == k) for k in np.unique(label)]
+    large = [group for group in groups if _lasts(o.of(group))]
+    large.sort(key=lambda group: -len(o.of(group).frame))
+    logger.info("moving: %d of %d tracks, things of %s", len(moving), len(ids), [len(group) for group in large])
+    places = {f"object-{k}": _places(images, ids[moving[group]]) for k, group in enumerate(large, 1)}
+    return replace(none, places=places, loose=len(moving) - sum(map(len, large)))
+
+
+def _errors_at_rest(
+    images: Sequence[ImageTracks],
+    observations: Observations,
+    cam_from_world: Mapping[int, pycolmap.Rigid3d],
+    options: PolishOptions,
+) -> Array:
+    """(m,) reprojection errors of the best points at rest, pixels."""
+    poses = [cam_from_world[image.position] for image in images]
+    first = poses[0].inverse()  # the first camera is the world: from there all points are in front
+    poses = [pose * first for pose in poses]
+    count = int(observations.point[-1]) + 1
+    cameras = State(
+        np.array([pose.rotation.matrix() for pose in poses]), np.array([pose.translation for pose in poses]),
+        np.zeros((count, 3)), np.ones(count),
+        np.log([image.camera.mean_focal_length() for image in images]), group=np.arange(len(images)),
+    )  # fmt: skip
+    far = max(float(np.linalg.norm(cameras.translation, axis=1).max()), 1e-9)
+    found = triangulated(cameras, observations, np.arange(count), np.full(count, 0.1 / far))
+    state = replace(cameras, bearing=found.bearing, inverse_distance=np.maximum(found.inverse_distance, 0.0))
+    adjustment = BundleAdjustment(
+        state, observations, replace(options, iterations=_ITERATIONS), ErrorModel(FIRST_SIGMA_PX),
+        free=Free(cameras=False),
+    )  # fmt: skip
+    adjustment.solve()
+    return adjustment.reprojection_errors()
+
+
+def _moves(observations: Observations, errors: Array, scene: Flags, options: PolishOptions) -> Flags:
+    """(n,) which points are at rest nowhere, beside the errors of the scene's own (n,)."""
+    if not scene.any():
+        return np.zeros(len(scene), bool)
+    size = log_errors(observations, errors)
+    center, spread = center_and_spread(size[scene])
+    return np.asarray(size > center + options.outlier_sigmas * max(spread, 0.1))
+
+
+def _links(observations: Observations, typical: Array, width: int) -> Index:
+    """(e, 2) points that are neighbours at some moment, and keep beside each other while both are seen.
+
+    Args:
+        typical: (n,) error of each as a point at rest: how far it moves by itself; width: of the image; pixels.
+    """
+    o, count = observations, len(typical)
+    last = int(o.frame.max())
+    place = np.full((count, last + 1, 2), np.nan)
+    place[o.point, o.frame] = o.pixels
+    linked = np.zeros((count, count), bool)
+    for frame in np.unique(np.linspace(o.frame.min(), last, _MOMENTS).round().astype(int)):
+        seen = np.flatnonzero(np.isfinite(place[:, frame, 0]))
+        distance = np.linalg.norm(place[seen, None, frame] - place[None, seen, frame], axis=2)
+        nearest = np.argsort(distance, axis=1)[:, 1 : _NEIGHBOURS + 1]
+        near = np.take_along_axis(distance, nearest, axis=1) < _REACH * width
+        linked[np.repeat(seen, near.sum(1)), seen[nearest[near]]] = True
+    edges = np.argwhere(linked)
+    apart = place[edges[:, 0]] - place[edges[:, 1]]
+    off = np.linalg.norm(apart - np.nanmean(apart, axis=1, keepdims=True), axis=2)
+    moved = np.sqrt(np.nanmean(off**2, axis=1))
+    return np.asarray(edges[moved < _TOGETHER * typical[edges].min(1)])
+
+
+def _lasts(observations: Observations) -> bool:
+    """Whether enough of the tracks of a thing are seen for long enough to solve it."""
+    return int((np.bincount(observations.frame) >= LEAST_TRACKS).sum()) >= LEAST_FRAMES
+
+
+# --- where things are ---------------------------------------------------------------------------------------------
+
+
+def _places(images: Sequence[ImageTracks], ids: Index) -> dict[int, Array]:
+    """By index of the frame, (n, 2) pixels of some tracks."""
+    seen = {image.frame: image.pixels[np.isin(image.ids, ids)] for image in images}
+    return {index: pixels for index, pixels in seen.items() if len(pixels)}
+
+
+def _between(pixels: Array, shape: tuple[int, ...], window_px: int) -> Flags:
+    """(h, w) mask of windows around places and of what lies between, on a smaller image."""
+    size = min(_MASK_WIDTH, shape[1])
+    mask = np.zeros((round(shape[0] * size / shape[1]), size), np.uint8)
+    x, y = np.floor((pixels + 0.5) * size / shape[1]).astype(int).T
+    mask[np.clip(y, 0, mask.shape[0] - 1), np.clip(x, 0, size - 1)] = 1
+    closed = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, _disc(round(0.5 * _REACH * size)))
+    return np.asarray(cv2.dilate(closed, _disc(round(0.5 * window_px * size / shape[1]))), bool)
+
+
+def _disc(radius: int) -> NDArray[np.uint8]:
+    size = (2 * radius + 1, 2 * radius + 1)
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, size), np.uint8)
+
+
+def _where(places: dict[int, Array]) -> str:
+    """When and where a thing is seen."""
+    frames = sorted(places)
+    middle = frames[len(frames) // 2]
+    low, high = np.quantile(places[middle], [0.02, 0.98], axis=0).round().astype(int)
+    spans = [f"{axis} from {a} to {b}" for axis, a, b in zip("xy", low, high, strict=True)]
+    return f"frames {frames[0]} to {frames[-1]}; in frame {middle} {' and '.join(spans)} pixels"
