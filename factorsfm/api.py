@@ -258,7 +258,8 @@ def _solve(
                 observed = held.enter_context(seen_again(result, stream.all_tracks(), again(), prior, options))
             if observed is not None:
                 add_objects(result, observed, options)
-                result.seconds["objects"] = stream.seconds["objects"]
+        if observed is not None:
+            result.seconds["objects"] = stream.seconds["objects"]
         if beside:
             add_left_out(result, beside)
         return result

@@ -24,7 +24,7 @@ from factorsfm.adjustment.problem import ErrorModel, Free
 from factorsfm.adjustment.state import State
 from factorsfm.frames.frame import Frame
 from factorsfm.mapping.all_points import triangulated
-from factorsfm.motion.moving import center_and_spread, log_errors
+from factorsfm.motion.moving import log_errors
 from factorsfm.objects.start import LEAST_FRAMES, LEAST_TRACKS
 from factorsfm.support.components import connected_components
 from factorsfm.support.options import Options, PolishOptions
@@ -42,6 +42,8 @@ _NEIGHBOURS, _REACH = 6, 0.08  # of a track in such a moment, within a share of 
 # Of what moves two neighbours against the scene: what they may move against each other. On rendered boxes 97 to 100 %
 # of the tracks of a thing are then on it; with twice as much, 84 %: what is beside it follows it along its outline.
 _TOGETHER = 0.25
+_LEAST_SHARED = 3  # frames in which two points are seen, that are compared
+_HALF = 1.349  # standard deviations: the width of the middle half of a normal distribution
 _MASK_WIDTH = 320  # pixels: an outline between tracks is no finer
 
 
@@ -97,8 +99,8 @@ def moving_things(
     if not len(moving):
         return none
     o = observations.of(moving)
-    typical = np.sqrt(observations.mean_by_point(errors**2))[moving]
-    label = connected_components(len(moving), _links(o, typical, images[0].camera.width))
+    against_scene = errors[np.isin(observations.point, moving)]
+    label = connected_components(len(moving), _links(o, against_scene, images[0].camera.width))
     groups = [np.flatnonzero(label == k) for k in np.unique(label)]
     large = [group for group in groups if _lasts(o.of(group))]
     large.sort(key=lambda group: -len(o.of(group).frame))
@@ -113,7 +115,7 @@ def _errors_at_rest(
     cam_from_world: Mapping[int, pycolmap.Rigid3d],
     options: PolishOptions,
 ) -> Array:
-    """(m,) reprojection errors of the best points at rest, pixels."""
+    """(m, 2) reprojection errors of the best points at rest, pixels."""
     poses = [cam_from_world[image.position] for image in images]
     first = poses[0].inverse()  # the first camera is the world: from there all points are in front
     poses = [pose * first for pose in poses]
@@ -131,28 +133,35 @@ def _errors_at_rest(
         free=Free(cameras=False),
     )  # fmt: skip
     adjustment.solve()
-    return adjustment.reprojection_errors()
+    return adjustment.reprojection_vectors()
 
 
 def _moves(observations: Observations, errors: Array, scene: Flags, options: PolishOptions) -> Flags:
-    """(n,) which points are at rest nowhere, beside the errors of the scene's own (n,)."""
+    """(n,) which points are at rest nowhere, beside the errors of the scene's own (n,).
+
+    Those of a scene that much moves before include some of the latter: usual is what the shortest half has.
+    """
     if not scene.any():
         return np.zeros(len(scene), bool)
-    size = log_errors(observations, errors)
-    center, spread = center_and_spread(size[scene])
+    size = log_errors(observations, np.linalg.norm(errors, axis=1))
+    usual = np.sort(size[scene])
+    half = (len(usual) + 1) // 2
+    widths = usual[half - 1 :] - usual[: len(usual) - half + 1]
+    low = int(np.argmin(widths))
+    center, spread = float(usual[low] + 0.5 * widths[low]), float(widths[low]) / _HALF
     return np.asarray(size > center + options.outlier_sigmas * max(spread, 0.1))
 
 
-def _links(observations: Observations, typical: Array, width: int) -> Index:
+def _links(observations: Observations, errors: Array, width: int) -> Index:
     """(e, 2) points that are neighbours at some moment, and keep beside each other while both are seen.
 
     Args:
-        typical: (n,) error of each as a point at rest: how far it moves by itself; width: of the image; pixels.
+        errors: (m, 2) of each as a point at rest: how it moves against the scene; width: of the image; pixels.
     """
-    o, count = observations, len(typical)
+    o, count = observations, int(observations.point[-1]) + 1
     last = int(o.frame.max())
-    place = np.full((count, last + 1, 2), np.nan)
-    place[o.point, o.frame] = o.pixels
+    place, against = np.full((2, count, last + 1, 2), np.nan)
+    place[o.point, o.frame], against[o.point, o.frame] = o.pixels, errors
     linked = np.zeros((count, count), bool)
     for frame in np.unique(np.linspace(o.frame.min(), last, _MOMENTS).round().astype(int)):
         seen = np.flatnonzero(np.isfinite(place[:, frame, 0]))
@@ -161,10 +170,24 @@ def _links(observations: Observations, typical: Array, width: int) -> Index:
         near = np.take_along_axis(distance, nearest, axis=1) < _REACH * width
         linked[np.repeat(seen, near.sum(1)), seen[nearest[near]]] = True
     edges = np.argwhere(linked)
-    apart = place[edges[:, 0]] - place[edges[:, 1]]
-    off = np.linalg.norm(apart - np.nanmean(apart, axis=1, keepdims=True), axis=2)
-    moved = np.sqrt(np.nanmean(off**2, axis=1))
-    return np.asarray(edges[moved < _TOGETHER * typical[edges].min(1)])
+    return np.asarray(edges[_apart(place, against, *edges.T) < _TOGETHER])
+
+
+def _apart(place: Array, against: Array, a: Index, b: Index) -> Array:
+    """(e,) by how much points move against each other while both are seen, over what they move against the scene; NaN
+    where they are not seen together for long enough to tell."""
+    both = np.isfinite(place[a, :, 0] + place[b, :, 0])
+    both[both.sum(1) < _LEAST_SHARED] = False
+    own = np.minimum(_motion(against[a], both), _motion(against[b], both))
+    return np.asarray(_motion(place[a] - place[b], both) / np.where(own > 0.0, own, np.nan))
+
+
+def _motion(places: Array, seen: Flags) -> Array:
+    """(e,) root mean square distance of places (e, k, 2) from their mean, over the frames (e, k) that count."""
+    weight = seen / np.maximum(seen.sum(1, keepdims=True), 1)
+    known = np.where(seen[:, :, None], places, 0.0)
+    off = known - np.einsum("ek,eki->ei", weight, known)[:, None]
+    return np.asarray(np.sqrt(np.einsum("ek,eki->e", weight, off**2)))
 
 
 def _lasts(observations: Observations) -> bool:

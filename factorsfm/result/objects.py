@@ -16,7 +16,7 @@ from factorsfm.frames.frame import Frame
 from factorsfm.objects.moving import MovingThings, moving_things
 from factorsfm.objects.object_result import ObjectFrame, ObjectResult
 from factorsfm.objects.observed import ObservedObjects, RememberedDepth
-from factorsfm.objects.scale import PriorOnScene
+from factorsfm.objects.scale import PriorOnScene, ScaleSource
 from factorsfm.objects.solve import SceneCamera, solve_object
 from factorsfm.priors.depth import DepthPrior
 from factorsfm.result.reconstruction import Reconstruction
@@ -32,7 +32,7 @@ def add_objects(result: Reconstruction, observed: ObservedObjects, options: Opti
     """Solve the objects that were seen beside a finished scene; notes say of each how its scale is known, or why it is
     not solved."""
     lenses = {position: result.camera_of(frame) for position, frame in enumerate(result.frames) if frame.registered}
-    cameras = _scene_cameras(result)
+    cameras = _scene_cameras(result, observed.depth_on_things)
     solved = []
     for name in observed.names:
         try:
@@ -95,8 +95,8 @@ def _said(things: MovingThings) -> str:
     return f"Things that move by themselves: {large}. Tracks that belong to none of them: {things.loose}."
 
 
-def _scene_cameras(result: Reconstruction) -> dict[int, SceneCamera]:
-    """The registered frames by position."""
+def _scene_cameras(result: Reconstruction, on_things: float) -> dict[int, SceneCamera]:
+    """The registered frames by position; `on_things`: as in `PriorOnScene`."""
     cameras = {}
     everywhere = float(np.median(np.linalg.norm(result.points, axis=1))) if len(result.points) else 1.0
     order = np.argsort(result.observation_frame, kind="stable")
@@ -108,7 +108,7 @@ def _scene_cameras(result: Reconstruction) -> dict[int, SceneCamera]:
         depth = float(np.median((frame.cam_from_world * seen)[:, 2])) if len(seen) else everywhere
         prior = None
         if (fit := frame.prior) is not None:
-            prior = PriorOnScene(fit.scale, fit.shift, fit.scale_std, fit.shift_std, fit.sigma, fit.smooth)
+            prior = PriorOnScene(fit.scale, fit.shift, fit.scale_std, fit.shift_std, fit.sigma, fit.smooth, on_things)
         cameras[position] = SceneCamera(frame.index, frame.cam_from_world, depth, prior)
     return cameras
 
@@ -128,6 +128,7 @@ class _Frame:
 class _Object:
     name: str
     scale_std: float | None
+    scale_from: ScaleSource | None
     reprojection_error: float
     note: str
     frames: list[_Frame]
@@ -150,6 +151,7 @@ def _plain(found: ObjectResult) -> _Object:
     return _Object(
         found.name,
         found.scale_std,
+        found.scale_from,
         found.reprojection_error,
         found.note,
         [
@@ -196,6 +198,7 @@ def _object(plain: _Object) -> ObjectResult:
         colors=_array(plain.colors, (len(plain.points), 3), plain.name).astype(np.uint8),
         reprojection_error=plain.reprojection_error,
         scale_std=plain.scale_std,
+        scale_from=plain.scale_from,
         note=plain.note,
     )
 

@@ -87,6 +87,29 @@ def test_path_and_rotation_of_a_rendered_box(prior: bool) -> None:
         assert "Nothing gives its scale" in note
 
 
+def test_a_box_is_found_and_solved_without_masks() -> None:
+    """As exactly as with masks; what is said of it names it and its place."""
+    shot = crossing().shot
+    depth = Maps(simulate_prior(shot))
+    result = factorsfm.reconstruct(shot.images, camera=shot.camera, depth=depth, objects="auto", shutter="global")
+    path, turn, scale = errors(result)
+    assert 0.0005 < path < 0.01
+    assert 0.05 < turn < 1.5
+    (found,) = result.objects
+    assert (found.name, len(found.frames), found.scale_from) == ("object-1", FRAMES, "prior")
+    assert found.scale_std is not None
+    assert abs(scale - 1.0) < 2.5 * found.scale_std
+    said = next(note for note in result.notes if note.startswith("Things that move by themselves: object-1 (frames"))
+    assert f"frames 0 to {FRAMES - 1}; in frame {FRAMES // 2} x from " in said
+    assert result.options["objects"] == "auto"
+    assert result.seconds["objects"] > 0.0
+
+
+def test_what_moves_by_itself_needs_frames_that_come_twice() -> None:
+    with pytest.raises(InputError, match=r"can be read twice; these are an iterator$"):
+        factorsfm.reconstruct(iter(crossing().shot.images), depth=None, objects="auto")
+
+
 def test_the_scene_is_as_good_as_without_the_box() -> None:
     """What is an object is none of the scene's points, and the cameras are those of the scene."""
     estimate = pose_arrays([frame.cam_from_world for frame in solved().frames])
@@ -105,7 +128,8 @@ def test_the_folder_has_it_all_and_comes_back(tmp_path: Path) -> None:
     result.write(tmp_path / "out")
     again = factorsfm.read_result(tmp_path / "out")
     (found,), (read,) = result.objects, again.objects
-    assert (read.name, read.note, read.scale_std) == (found.name, found.note, found.scale_std)
+    assert (read.name, read.note, read.scale_from) == (found.name, found.note, found.scale_from)
+    assert read.scale_std == found.scale_std
     np.testing.assert_array_equal(read.points, found.points)
     np.testing.assert_array_equal(read.colors, found.colors)
     for a, b in zip(read.frames, found.frames, strict=True):
@@ -118,6 +142,7 @@ def test_the_folder_has_it_all_and_comes_back(tmp_path: Path) -> None:
         "frames": FRAMES,
         "points": len(found.points),
         "scale_std": found.scale_std,
+        "scale_from": "prior",
         "rotation_std": found.rotation_std,
         "reprojection_error": found.reprojection_error,
     }
@@ -166,5 +191,7 @@ def test_objects_are_of_videos_and_match_frames(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "objects" / "box" / "5000.png"), np.zeros((180, 320), np.uint8))
     with pytest.raises(InputError, match="images in any order show no motion"):
         factorsfm.reconstruct(tmp_path / "images", objects=tmp_path / "objects", unordered=True, depth=None)
+    with pytest.raises(InputError, match="images in any order show no motion"):
+        factorsfm.reconstruct(tmp_path / "images", objects="auto", unordered=True, depth=None)
     with pytest.raises(InputError, match="no mask of an object in the given folder matches a frame"):
         factorsfm.reconstruct(tmp_path / "images", objects=tmp_path / "objects", camera=shot.camera, depth=None)
