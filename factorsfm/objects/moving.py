@@ -36,12 +36,15 @@ Flags = NDArray[np.bool_]
 
 logger = logging.getLogger(__name__)
 
+_MOVED_PX = 0.25  # typical error of a point at rest, from which it moves: what rests before a fixed camera stays within
+_LITTLE_PARALLAX = 0.1  # camera path over depth, from which the depth of a point starts
 _ITERATIONS = 4  # of points alone, until they show what fits the cameras
 _MOMENTS = 24  # of the shot, in which neighbours are looked for
 _NEIGHBOURS, _REACH = 6, 0.08  # of a track in such a moment, within a share of the image's width
-# Of what moves two neighbours against the scene: what they may move against each other. On rendered boxes 97 to 100 %
-# of the tracks of a thing are then on it; with twice as much, 84 %: what is beside it follows it along its outline.
-_TOGETHER = 0.25
+# Of what moves two neighbours against the scene, while both are seen: what they may move against each other. On
+# rendered boxes 99 to 100 % of the tracks of a thing are then on it, from 0.25 to 0.7. With 0.25, what goes along with
+# the camera and turns falls apart: as points at rest, most of its motion passes for depth.
+_TOGETHER = 0.5
 _LEAST_SHARED = 3  # frames in which two points are seen, that are compared
 _HALF = 1.349  # standard deviations: the width of the middle half of a normal distribution
 _MASK_WIDTH = 320  # pixels: an outline between tracks is no finer
@@ -120,13 +123,15 @@ def _errors_at_rest(
     first = poses[0].inverse()  # the first camera is the world: from there all points are in front
     poses = [pose * first for pose in poses]
     count = int(observations.point[-1]) + 1
+    translation = np.array([pose.translation for pose in poses])
+    farthest = float(np.linalg.norm(translation, axis=1).max())
     cameras = State(
-        np.array([pose.rotation.matrix() for pose in poses]), np.array([pose.translation for pose in poses]),
+        np.array([pose.rotation.matrix() for pose in poses]),
+        translation / farthest if farthest > 0.0 else translation,
         np.zeros((count, 3)), np.ones(count),
         np.log([image.camera.mean_focal_length() for image in images]), group=np.arange(len(images)),
     )  # fmt: skip
-    far = max(float(np.linalg.norm(cameras.translation, axis=1).max()), 1e-9)
-    found = triangulated(cameras, observations, np.arange(count), np.full(count, 0.1 / far))
+    found = triangulated(cameras, observations, np.arange(count), np.full(count, _LITTLE_PARALLAX))
     state = replace(cameras, bearing=found.bearing, inverse_distance=np.maximum(found.inverse_distance, 0.0))
     adjustment = BundleAdjustment(
         state, observations, replace(options, iterations=_ITERATIONS), ErrorModel(FIRST_SIGMA_PX),
@@ -149,7 +154,8 @@ def _moves(observations: Observations, errors: Array, scene: Flags, options: Pol
     widths = usual[half - 1 :] - usual[: len(usual) - half + 1]
     low = int(np.argmin(widths))
     center, spread = float(usual[low] + 0.5 * widths[low]), float(widths[low]) / _HALF
-    return np.asarray(size > center + options.outlier_sigmas * max(spread, 0.1))
+    limit = center + options.outlier_sigmas * max(spread, 0.1)
+    return np.asarray(size > max(limit, np.log(_MOVED_PX)))
 
 
 def _links(observations: Observations, errors: Array, width: int) -> Index:

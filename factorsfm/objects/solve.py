@@ -28,8 +28,8 @@ Array = NDArray[np.float64]
 # On rendered boxes: with 5.6 pixels of perspective and more all starts are right, by margins of 31 and more. With up to
 # 4.7, one in three is wrong, by margins of up to 77.
 _LEAST_PERSPECTIVE_PX, _LEAST_MARGIN = 5.2, 25.0
-_LARGEST_ROTATION_STD = 1.2  # degrees. With 0.9 the path is still right to 1 %, with 1.5 wrong by 7 %, and the rotation
-# by 30 degrees: the true errors are several times as large.
+# Degrees. With 0.9 the path of rendered boxes is right to 1 %; with 1.5 wrong by 7 %, and the rotation by 30 degrees.
+_LARGEST_ROTATION_STD = 1.2
 # Of the tracks on it. One figure with motion blur has 0.98 and more, two that walk in opposite directions 0.5.
 _RIGID_SHARE, _EXPLAINED_PX = 0.8, 1.0
 _TOO_FAR = 0.3  # inverse distance over the median: nothing of a thing is three times as far away as the rest

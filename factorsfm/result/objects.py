@@ -71,6 +71,7 @@ def seen_again(
         replace(images[position], position=position, index=frame.index, camera=result.camera_of(frame))
         for position, frame in shown
     ]
+    seen = [image.of(image.invertible) for image in seen]
     poses = {position: frame.cam_from_world for position, frame in shown if frame.cam_from_world is not None}
     things = moving_things(seen, poses, result.track_ids, options)
     result.notes.append(_said(things))
