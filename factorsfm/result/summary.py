@@ -143,6 +143,7 @@ def _object_json(found: ObjectResult) -> dict[str, Any]:
         "frames": len(found.frames),
         "points": len(found.points),
         "scale_std": found.scale_std,
+        "scale_from": found.scale_from,
         "rotation_std": found.rotation_std,
         "reprojection_error": found.reprojection_error,
     }
