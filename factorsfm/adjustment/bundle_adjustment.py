@@ -21,11 +21,11 @@ from factorsfm.adjustment.noise import block_inflation
 from factorsfm.adjustment.observations import Observations, PriorObservations
 from factorsfm.adjustment.problem import NOTHING, POSES, CameraTerm, ErrorModel, Free, Known
 from factorsfm.adjustment.residuals import cauchy
-from factorsfm.adjustment.semidefinite import conditioned, covariance_of, solution
 from factorsfm.adjustment.state import State
 from factorsfm.adjustment.track_term import TrackTerm
 from factorsfm.support.options import PolishOptions
 from factorsfm.support.rotations import exponential
+from factorsfm.support.semidefinite import conditioned, covariance_of, solution
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from factorsfm.adjustment.columns import Columns
 from factorsfm.adjustment.state import State
 from factorsfm.support.rotations import cross_matrices
+from factorsfm.support.semidefinite import solution
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -68,7 +69,7 @@ class Marginals:
         for cross, columns, span in self.blocks:
             gain = np.einsum("cni,ni->nc", cross.reshape(len(columns), -1, 3), self.point[span, 2])
             variance[span] += np.einsum("nc,nc->n", gain @ camera[np.ix_(columns, columns)], gain)
-        return np.sqrt(variance)
+        return np.sqrt(np.maximum(variance, 0.0))
 
 
 def in_scene_unit(marginals: Marginals, state: State, control: Array | None = None) -> Array:
@@ -139,7 +140,8 @@ def in_scene(marginals: Marginals, state: State, weights: Array) -> Array:
     )
     weighted = weights[:, None, None] ** 2 * moved
     normal = np.einsum("nig,nih->gh", weighted, moved)
-    measured = np.einsum("nij,nig->njg", by_point, weighted) @ np.linalg.inv(normal)
+    by_normal = solution(normal, np.eye(7))  # of few points, some movements of the coordinates are none of them
+    measured = np.einsum("nij,nig->njg", by_point, weighted) @ by_normal
     centers = -np.einsum("kji,kj->ki", state.rotation, state.translation)
     poses = Columns.of(state).poses
     motion = np.zeros((len(marginals.camera), 7))

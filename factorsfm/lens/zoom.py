@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import FocalPrior
-from factorsfm.adjustment.semidefinite import squared_deviations
 from factorsfm.adjustment.state import LENS_SIZE, State
 from factorsfm.lens.certainty import lens_covariances
 from factorsfm.lens.solver import LensSolver
 from factorsfm.motion.shot_kind import LEAST_GAIN, translation_gain
 from factorsfm.support.options import PolishOptions
+from factorsfm.support.semidefinite import squared_deviations
 
 Array = NDArray[np.float64]
 

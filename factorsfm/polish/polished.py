@@ -17,6 +17,7 @@ from factorsfm.lens.rolling_shutter import Shutter
 from factorsfm.motion.at_rest import Rest
 from factorsfm.motion.shot_kind import Motion
 from factorsfm.polish.observability import CameraObservability
+from factorsfm.support.semidefinite import deviations
 from factorsfm.support.similarity import Similarity
 
 Array = NDArray[np.float64]
@@ -91,6 +92,6 @@ class Polished:
         """
         if self.prior is None:
             return
-        std = np.sqrt(camera_covariance.diagonal())
+        std = deviations(camera_covariance)
         self.prior.residual, self.prior.residual_sigma = adjustment.prior_residuals()
         self.prior.scale_std, self.prior.shift_std = std[adjustment.columns.scales], std[adjustment.columns.shifts]

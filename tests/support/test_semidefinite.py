@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from factorsfm.adjustment.semidefinite import conditioned, covariance_of, solution, squared_deviations
+from factorsfm.support.semidefinite import conditioned, covariance_of, solution, squared_deviations
 
 
 def information_without(direction, scales):
