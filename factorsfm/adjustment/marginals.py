@@ -15,6 +15,8 @@ from factorsfm.support.semidefinite import solution
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
+_ROUNDING = 1e-12  # of numbers that cancel
+
 
 @dataclass(frozen=True, slots=True)
 class Marginals:
@@ -44,8 +46,13 @@ class Marginals:
             pull[:, columns] -= (cross @ weighted[span].reshape(-1, measured.shape[2])).T
         moved = pull @ self.camera
         spread = moved @ pull.T + np.einsum("nig,nih->gh", measured, weighted)
-        mixed = motion @ moved
-        return np.asarray(self.camera - mixed - mixed.T + motion @ spread @ motion.T)
+        mixed, carried = motion @ moved, motion @ spread @ motion.T
+        relative = self.camera - mixed - mixed.T + carried
+        # Where movements of the coordinates are hardly determined, large numbers cancel: what rounding leaves is as
+        # uncertain as it is wrong.
+        cancelled = self.camera.diagonal() + 2.0 * np.abs(mixed.diagonal()) + carried.diagonal()
+        relative[np.diag_indices_from(relative)] += _ROUNDING * cancelled
+        return np.asarray(relative)
 
     def inverse_distances(self, points: Index) -> Array:
         """(p, p) joint covariance of the inverse distances of some points."""

@@ -57,6 +57,8 @@ def polish(
     first_focal: tuple[Array, float] | None = None,
     recording: Recording | None = None,
     suspects: Index | None = None,
+    *,
+    in_time: bool = False,
 ) -> Polished:
     """Triangulate all tracks and minimise over all registered frames.
 
@@ -70,6 +72,7 @@ def polish(
         recording: of which the images are all, if their rows may have been read one after another; None: all at once,
             or in no order of time.
         suspects: ids (ascending) of tracks that count only where they agree with the others.
+        in_time: whether the images were recorded one after another, so that a lens may have zoomed over them.
         control: known poses, points and lengths; it takes part at the end, and only where the camera moves.
         factors: of the caller, where there is no control; they take part as it does.
 
@@ -77,7 +80,7 @@ def polish(
         ReconstructionError: hardly any tracks are left that connect frames, or the control does not determine where its
             world is.
     """
-    shot = Shot.of(images, map_points, focal, shape, groups, first_focal, recording, suspects)
+    shot = Shot.of(images, map_points, focal, shape, groups, first_focal, recording, suspects, in_time=in_time)
     named = _named(shot, control, factors, options.polish.max_frames // 2)
     start, frames, left_out = _start(shot, options, named, progress)
     progress("polish: all tracks")
@@ -171,7 +174,8 @@ def _solved(
         *adjustment.observation_sigmas(), start.core.motion, *_pose_covariances(covariance, adjustment.state),
         camera_observability(adjustment, marginals, covariance), point_std,
         left_out, prior, start.core.lens, start.core.shutter, moving=start.core.moving, turns=start.core.turns,
-        rest=start.core.rest, rival=start.core.rival, inflation=start.inflation, contradiction=start.depths.correlation,
+        rest=start.core.rest, rival=start.core.rival, zoom=start.core.zoom,
+        inflation=start.inflation, contradiction=start.depths.correlation,
     )  # fmt: skip
     result.describe_prior(adjustment, covariance)
     return adjustment, result

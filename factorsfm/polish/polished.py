@@ -48,6 +48,7 @@ class Polished:
         rest: what rests in the image while other things move, None where nothing does.
         rival: cost of this reading of the shot over that of the next best one in which something else is the scene; 0
             where nothing else may be.
+        zoom: longest over shortest focal length of a zoom that the tracks ask for and that is not estimated; 0: none.
         inflation: of the variance of the core tracks, since errors of neighbours are alike, see `error_inflation`.
         contradiction: see `NearAndFar.correlation`.
         world_alignment: from this world to that of the control; control: its residuals. None without control.
@@ -78,6 +79,7 @@ class Polished:
     turns: bool = False
     rest: Rest | None = None
     rival: float = 0.0
+    zoom: float = 0.0
     inflation: float = 1.0
     contradiction: float | None = None
     world_alignment: Similarity | None = None

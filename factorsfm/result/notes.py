@@ -90,6 +90,11 @@ def result_notes(
         )
     if polished.lens is not None:
         notes.append(lens_note(polished.lens))
+    if polished.zoom:
+        notes.append(
+            f"The tracks ask for a zoom: one that changes the focal length by {polished.zoom:.2f} explains them far "
+            "better than one focal length; try --lens zoom."
+        )
     if polished.control is not None:
         notes += control_notes(polished.control)
     if polished.unused:
@@ -112,13 +117,16 @@ def result_notes(
 
 def _motion_notes(polished: Polished, has_depth: bool) -> list[str]:
     """What a camera that does not translate leaves open."""
-    motion = polished.motion
+    motion, zooms = polished.motion, polished.lens is not None and polished.lens.zooms
     depths = "depths and their scale come from the prior alone" if has_depth else "depths are unknown without a prior"
+    if motion.kind is ShotKind.STATIC and zooms:
+        return [f"The camera stays where it is and only zooms; {depths}."]
     if motion.kind is ShotKind.STATIC:
         return [f"The camera is static: no frame moves by more than {motion.displacement_px:.2f} pixels; {depths}."]
     if motion.kind is ShotKind.ROTATION:
         return [
-            "The camera only rotates: its translation is not observable from geometry and is reported as zero; "
+            f"The camera only {'rotates and zooms' if zooms else 'rotates'}: its translation is not observable from "
+            "geometry and is reported as zero; "
             f"{depths}."
         ]
     return []
@@ -128,13 +136,15 @@ def lens_note(estimate: LensEstimate) -> str:
     """What the shot says of an unknown lens."""
     focals, std = estimate.lens.focal, f"standard deviation {100 * estimate.focal_std.max():.1f} %"
     focal, zoom, held = float(np.median(focals)), "", not estimate.focal_std.any()
-    if estimate.zoom_std is not None and len(focals) == 1:
+    if estimate.zoom_std is not None and not estimate.zooms:
         zoom = f" No zoom was found: what it might be is less than {200 * estimate.zoom_std:.1f} %."
-    elif estimate.zoom_std is not None:
+    elif estimate.zooms:
         zoom = (
             f" It changes from {focals[0]:.0f} to {focals[-1]:.0f} pixels; the ratio of the longest to the shortest is "
             f"{focals.max() / focals.min():.3f} ± {estimate.zoom_std * focals.max() / focals.min():.3f}."
         )
+        if not estimate.announced:
+            zoom += " Nobody announced this zoom; --lens focal keeps one focal length."
     if not (estimate.determined or estimate.rough):
         reason = f"this shot does not determine it ({std})"
         if estimate.misfit_px:

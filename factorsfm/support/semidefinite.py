@@ -33,10 +33,13 @@ def solution(information: Array, gradient: Array) -> Array:
 def covariance_of(information: Array) -> Array:
     """``information^-1``; what is not determined has a very large variance, not a negative one."""
     try:
-        np.linalg.cholesky(information)
-        return np.asarray(np.linalg.inv(information))
+        root = np.linalg.cholesky(information)
     except np.linalg.LinAlgError:
         return _by_spectrum(information, _large_inverse)
+    if not np.isfinite(root).all():
+        return _by_spectrum(information, _large_inverse)
+    half = np.linalg.solve(root, np.eye(information.shape[-1]))  # its square has no negative eigenvalues
+    return np.asarray(half.swapaxes(-1, -2) @ half)
 
 
 def root_of(matrix: Array) -> Array:
@@ -72,7 +75,7 @@ def deviations(covariance: Array) -> Array:
 
 def squared_deviations(values: Array, covariance: Array) -> float:
     """``values covariance^-1 values``, of a covariance that may have been seen on too few samples to have full rank."""
-    return float(values @ covariance_of(conditioned(covariance)) @ values)
+    return float((triangular_solution(root_of(conditioned(covariance)), values) ** 2).sum())
 
 
 # --- where something is not determined --------------------------------------------------------------------------
