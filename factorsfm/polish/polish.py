@@ -25,12 +25,13 @@ from factorsfm.control.solve import Controlled, frames_under_control, solve_unde
 from factorsfm.control.with_factors import ShotFactors, solve_with_factors
 from factorsfm.lens.rolling_shutter import Recording, seen_at_once
 from factorsfm.mapping.mapped_images import MappedImage
+from factorsfm.motion.stretches import Stretch, stretches
 from factorsfm.polish.connected_frames import connected_frames
 from factorsfm.polish.frames_between import add_frames_between, solved_frames, too_few_tracks
 from factorsfm.polish.observability import camera_observability
 from factorsfm.polish.polished import Polished
 from factorsfm.polish.shot import Shot
-from factorsfm.polish.start import PolishStart, polish_start
+from factorsfm.polish.start import Core, PolishStart, polish_start
 from factorsfm.support.errors import ReconstructionError
 from factorsfm.support.options import Options, PolishOptions
 from factorsfm.support.status import ShotKind
@@ -177,8 +178,17 @@ def _solved(
         rest=start.core.rest, rival=start.core.rival, zoom=start.core.zoom,
         inflation=start.inflation, contradiction=start.depths.correlation,
     )  # fmt: skip
+    if shot.in_time:
+        result.stretches = _stretches(start.core, frames, options)
     result.describe_prior(adjustment, covariance)
     return adjustment, result
+
+
+def _stretches(core: Core, frames: list[int], options: PolishOptions) -> tuple[Stretch, ...]:
+    """What the camera does when, by positions of the images."""
+    found = stretches(core.adjustment, core.motion, options)
+    ends = [frames[s.first] - 1 for s in found[1:]] + [frames[-1]]
+    return tuple(Stretch(frames[s.first], end, s.kind) for s, end in zip(found, ends, strict=True))
 
 
 def _pose_covariances(covariance: Array, state: State) -> tuple[Array, Array]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from factorsfm.control.fit import ControlFit
 from factorsfm.lens.lens import LensEstimate
 from factorsfm.motion.shot_kind import LEAST_GAIN
+from factorsfm.motion.stretches import Stretch
 from factorsfm.polish.polished import Polished
 from factorsfm.result.reconstruction import FrameResult, Reconstruction, RollingShutter
 from factorsfm.support.status import ShotKind
@@ -82,7 +83,7 @@ def result_notes(
         depth_given: whether there is a depth prior; has_depth: whether a frame has a depth map.
         interval: seconds between two frames, 0 if unknown.
     """
-    notes = _motion_notes(polished, has_depth)
+    notes = _motion_notes(polished, has_depth) + stretch_notes(result.stretches)
     if polished.moving:
         notes.append(
             f"Something moves by itself: {100 * polished.moving:.0f} % of the longest tracks, which are left out. "
@@ -130,6 +131,15 @@ def _motion_notes(polished: Polished, has_depth: bool) -> list[str]:
             f"{depths}."
         ]
     return []
+
+
+def stretch_notes(stretches: Sequence[Stretch]) -> list[str]:
+    """What the camera does when, of a shot that is not of one kind throughout."""
+    if len(stretches) < 2:
+        return []
+    does = {ShotKind.STATIC: "stands", ShotKind.ROTATION: "only turns", ShotKind.GENERAL: "moves"}
+    said = ", ".join(f"{does[s.kind]} in {s.first} to {s.last}" for s in stretches)
+    return [f"By frames, the camera {said}."]
 
 
 def lens_note(estimate: LensEstimate) -> str:

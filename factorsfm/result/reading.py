@@ -15,6 +15,7 @@ from factorsfm.camera.files import camera_from_json, camera_to_json
 from factorsfm.camera.projection import PIXEL_CENTER
 from factorsfm.control.fit import ControlFit
 from factorsfm.inertial.fit import ImuFit
+from factorsfm.motion.stretches import Stretch
 from factorsfm.polish.observability import CameraObservability
 from factorsfm.result.objects import read_objects
 from factorsfm.result.reconstruction import FrameResult, LensFit, PriorFit, Reconstruction, RollingShutter
@@ -49,6 +50,14 @@ class _Status:
 
 
 @dataclass(frozen=True, slots=True)
+class _Stretch:
+    """What summary.json says of a stretch."""
+
+    frames: tuple[int, int]
+    kind: ShotKind
+
+
+@dataclass(frozen=True, slots=True)
 class _Summary:
     """What summary.json says that the other files do not."""
 
@@ -66,6 +75,7 @@ class _Summary:
     parts: int
     statuses: list[_Status]
     doubts: list[str] = field(default_factory=list)
+    stretches: list[_Stretch] = field(default_factory=list)
 
 
 def read_result(directory: str | Path) -> Reconstruction:
@@ -137,6 +147,7 @@ def _reconstruction(summary: _Summary, model: pycolmap.Reconstruction) -> Recons
         observation_error=np.concatenate([np.empty(0), *errors]),
         prior_residual=np.full(len(pixels), np.nan),
         kind=summary.kind,
+        stretches=tuple(Stretch(*s.frames, s.kind) for s in summary.stretches),
         parallax=summary.parallax,
         lens=summary.lens,
         shutter=summary.shutter,

@@ -11,7 +11,7 @@ from factorsfm.support.errors import ReconstructionError
 from factorsfm.support.options import Options
 from tests.estimation_problems import Problem, make_problem, mapped_images, perturbed
 
-LENSES = ("fixed", "distortion", *(pytest.param(lens, marks=pytest.mark.slow) for lens in ("focal", "all", "zoom")))
+LENSES = ("distortion", *(pytest.param(lens, marks=pytest.mark.slow) for lens in ("fixed", "focal", "all", "zoom")))
 
 
 def seen_by(state, points, noise_px=0.1, seed=0):
