@@ -53,8 +53,12 @@ class _Status:
 class _Stretch:
     """What summary.json says of a stretch."""
 
-    frames: tuple[int, int]
+    frames: list[int]
     kind: ShotKind
+
+    def read(self) -> Stretch:
+        first, last = self.frames
+        return Stretch(first, last, self.kind)
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +151,7 @@ def _reconstruction(summary: _Summary, model: pycolmap.Reconstruction) -> Recons
         observation_error=np.concatenate([np.empty(0), *errors]),
         prior_residual=np.full(len(pixels), np.nan),
         kind=summary.kind,
-        stretches=tuple(Stretch(*s.frames, s.kind) for s in summary.stretches),
+        stretches=tuple(stretch.read() for stretch in summary.stretches),
         parallax=summary.parallax,
         lens=summary.lens,
         shutter=summary.shutter,

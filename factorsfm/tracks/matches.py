@@ -29,7 +29,9 @@ MAX_FEATURES = 8192  # per image
 EXHAUSTIVE_UP_TO = 60  # images; in a larger set each is matched with its neighbours by appearance and by name
 _NEIGHBOURS_BY_APPEARANCE, _NEIGHBOURS_BY_NAME = 25, 4
 _VISUAL_WORDS, _SAMPLED_DESCRIPTORS = 256, 100_000  # of the vocabulary, which is made from the set itself
-_ONE_THREAD_ABOVE = 6e6  # pixels of an image: SIFT needs about 150 bytes for each of them
+# Pixels of an image that SIFT looks at in double size, for which it needs 240 bytes for each; else 30. The largest
+# features of an image come first: a large one has enough of them without its finest.
+_DOUBLED_UP_TO = 6e6
 _SEED = 0
 
 
@@ -133,8 +135,7 @@ def _extract(database: Path, images: Path, names: Sequence[str], masks: Path | N
     """Find SIFT features of images of so many pixels at most."""
     options = pycolmap.FeatureExtractionOptions()
     options.sift.max_num_features = MAX_FEATURES
-    if pixels > _ONE_THREAD_ABOVE:
-        options.num_threads = 1
+    options.sift.first_octave = -1 if pixels <= _DOUBLED_UP_TO else 0
     reader = pycolmap.ImageReaderOptions()
     if masks is not None:
         reader.mask_path = masks

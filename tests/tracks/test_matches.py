@@ -170,3 +170,11 @@ def test_images_without_features_are_empty(tmp_path: Path, shot: RenderedShot) -
     again = read_matches(tmp_path / "m.db", ["unknown.png"])
     assert len(again.keypoints[0]) == 0
     assert again.pairs == []
+
+
+def test_images_are_numbered_by_name_whatever_is_found_first(shot: RenderedShot, tmp_path: Path) -> None:
+    """Pairs are verified from the smaller number to the larger one: another order would give other matches."""
+    names = write_images(shot, tmp_path / "images")
+    match_images(tmp_path / "m.db", tmp_path / "images", names, [shot.camera] * 3)
+    with pycolmap.Database.open(tmp_path / "m.db") as db:
+        assert [image.name for image in db.read_all_images()] == sorted(names)
