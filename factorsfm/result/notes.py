@@ -155,6 +155,11 @@ def lens_note(estimate: LensEstimate) -> str:
         )
         if not estimate.announced:
             zoom += " Nobody announced this zoom; --lens focal keeps one focal length."
+    if estimate.contradicted_px:
+        zoom += (
+            f" What was known of it before says {estimate.contradicted_px:.0f} pixels, which the images contradict: "
+            "cropped or stretched pictures, or a rolling shutter, may explain it."
+        )
     if not (estimate.determined or estimate.rough):
         reason = f"this shot does not determine it ({std})"
         if estimate.misfit_px:
