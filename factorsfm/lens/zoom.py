@@ -14,7 +14,7 @@ from factorsfm.adjustment.problem import FocalPrior
 from factorsfm.adjustment.state import LENS_SIZE, State
 from factorsfm.lens.certainty import lens_covariances
 from factorsfm.lens.search import some_frames
-from factorsfm.lens.solver import LensSolver
+from factorsfm.lens.solver import LensSolver, NotInvertibleError
 from factorsfm.motion.shot_kind import LEAST_GAIN, translation_gain
 from factorsfm.support.options import PolishOptions
 from factorsfm.support.semidefinite import squared_deviations
@@ -110,14 +110,17 @@ def unannounced_zoom(
 def _share_of_cost(zoom: Zoom, fixed: BundleAdjustment) -> float:
     """Cost of the tracks with a zoom over that with one focal length, judged with the same noise."""
     with_one, with_zoom = (float(p.observation_costs().sum()) for p in _at_one_scale(fixed, zoom.adjustment))
-    return with_zoom / with_one
+    return with_zoom / max(with_one, 1e-300)
 
 
 def _turns_and_zooms(fixed: BundleAdjustment, times: Array, options: PolishOptions) -> bool:
     """Whether a camera that turns and zooms explains a few frames as well as one that moves with one focal length."""
     frames, part, few = some_frames(fixed.state, fixed.observations)
     general = BundleAdjustment(part, few, options, fixed.errors)
-    _, turning = _turning_start(general, times[frames], options)
+    try:
+        _, turning = _turning_start(general, times[frames], options)
+    except NotInvertibleError:
+        return False
     if float(np.ptp(turning.log_focal)) < _LEAST_ZOOM:
         return False
     gain = translation_gain(*_at_one_scale(BundleAdjustment(turning, few, options, fixed.errors), general))
