@@ -175,7 +175,7 @@ class BundleAdjustment:
     def lens_step(self) -> Array:
         """By how much a Newton step moves what is free of log focal lengths and shape; 0 of what nothing is seen."""
         information, gradient = self.condensed()
-        seen = information.diagonal() > 1e-200
+        seen = information.diagonal() > 1e-100
         step = np.zeros(len(gradient))
         step[seen] = -solution(information[np.ix_(seen, seen)], gradient[seen])
         return np.asarray(step[np.searchsorted(self._free, self.columns.optics.start + self.free_optics)])

@@ -15,11 +15,12 @@ Array = NDArray[np.float64]
 
 # Of a matrix with a unit diagonal: smaller eigenvalues are rounding errors of the elimination.
 _LEAST_EIGENVALUE = 1e-12
+_NOTHING = 1e-100  # information; its inverse is still a number, and so is its square
 
 
 def conditioned(information: Array) -> Array:
     """The matrix (n, n) with a ridge far below any information that matters."""
-    return np.asarray(information + np.diag(_LEAST_EIGENVALUE * np.maximum(information.diagonal(), 1e-300)))
+    return np.asarray(information + np.diag(_LEAST_EIGENVALUE * np.maximum(information.diagonal(), _NOTHING)))
 
 
 def solution(information: Array, gradient: Array) -> Array:
