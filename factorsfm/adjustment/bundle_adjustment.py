@@ -21,11 +21,11 @@ from factorsfm.adjustment.noise import block_inflation
 from factorsfm.adjustment.observations import Observations, PriorObservations
 from factorsfm.adjustment.problem import NOTHING, POSES, CameraTerm, ErrorModel, Free, Known
 from factorsfm.adjustment.residuals import cauchy
-from factorsfm.adjustment.semidefinite import conditioned, covariance_of, solution
 from factorsfm.adjustment.state import State
 from factorsfm.adjustment.track_term import TrackTerm
 from factorsfm.support.options import PolishOptions
 from factorsfm.support.rotations import exponential
+from factorsfm.support.semidefinite import conditioned, covariance_of, solution
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -175,7 +175,7 @@ class BundleAdjustment:
     def lens_step(self) -> Array:
         """By how much a Newton step moves what is free of log focal lengths and shape; 0 of what nothing is seen."""
         information, gradient = self.condensed()
-        seen = information.diagonal() > 1e-200
+        seen = information.diagonal() > 1e-100
         step = np.zeros(len(gradient))
         step[seen] = -solution(information[np.ix_(seen, seen)], gradient[seen])
         return np.asarray(step[np.searchsorted(self._free, self.columns.optics.start + self.free_optics)])

@@ -29,6 +29,7 @@ from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.motion.shot_kind import LEAST_GAIN, Motion, translation_gain
 from factorsfm.support.options import Options
 from factorsfm.support.rotations import exponential
+from factorsfm.support.semidefinite import solution
 from factorsfm.support.status import ShotKind
 
 Array = NDArray[np.float64]
@@ -232,7 +233,7 @@ def seen_at_once(state: State, observations: Observations, weight: Array, *, mov
         information = np.add.reduceat(gain @ jacobian, first)
         gradient = np.add.reduceat(gain @ residual[:, :, None], first)
         step = np.zeros((len(first), 6))
-        step[:, :free] = -np.linalg.solve(information, gradient)[:, :, 0]
+        step[:, :free] = -solution(information, gradient)[:, :, 0]
         turn = exponential(-step[:, :3])
         translation = np.einsum("kij,kj->ki", turn, state.translation - step[:, 3:])
         state = replace(state, rotation=turn @ state.rotation, translation=translation)

@@ -15,6 +15,7 @@ from factorsfm.lens.lens import Lens, through
 from factorsfm.support.options import PolishOptions
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
 
 _FIELDS_OF_VIEW = np.radians(np.geomspace(20.0, 100.0, 8))  # across the longer side of the area that the tracks fill
 _SEARCH_FRAMES, _SEARCH_ITERATIONS, _PARABOLAS = 24, 15, 3
@@ -33,7 +34,7 @@ def search_lens(
         sigmas: (6,) prior standard deviations of the shape around that of the solution; None: it is constant.
     """
     guess = Lens.of(adjustment.state)
-    state, few = some_frames(adjustment.state, adjustment.observations)
+    _, state, few = some_frames(adjustment.state, adjustment.observations)
     options = replace(options, iterations=_SEARCH_ITERATIONS, tolerance=1e-3)
     known = Known(lens=None if sigmas is None else LensPrior(guess.shape, sigmas))
 
@@ -71,8 +72,8 @@ def search_lens(
     return Lens(factor * guess.focal, found.lens), cost
 
 
-def some_frames(state: State, observations: Observations) -> tuple[State, Observations]:
-    """Few frames, evenly spread, that of the world among them, and the points that two of them see."""
+def some_frames(state: State, observations: Observations) -> tuple[Index, State, Observations]:
+    """Few frames, evenly spread, that of the world among them: their rows, and the points that two of them see."""
     count = len(state.rotation)
     frames = np.unique([*np.linspace(0, count - 1, min(count, _SEARCH_FRAMES)).astype(int), state.world])
     keep = np.isin(observations.frame, frames)
@@ -87,4 +88,8 @@ def some_frames(state: State, observations: Observations) -> tuple[State, Observ
         world=int(np.searchsorted(frames, state.world)),
     )
     frame, point = observations.frame[keep], observations.point[keep]
-    return part, observations.at(keep, frame=np.searchsorted(frames, frame), point=np.searchsorted(points, point))
+    return (
+        frames,
+        part,
+        observations.at(keep, frame=np.searchsorted(frames, frame), point=np.searchsorted(points, point)),
+    )

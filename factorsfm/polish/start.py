@@ -15,14 +15,14 @@ from factorsfm.adjustment.state import State
 from factorsfm.lens.estimate import estimate_lens
 from factorsfm.lens.lens import LensEstimate
 from factorsfm.lens.rolling_shutter import Shutter, find_shutter
-from factorsfm.lens.zoom import find_zoom
+from factorsfm.lens.zoom import Zoom, find_zoom, unannounced_zoom
 from factorsfm.mapping.all_points import triangulated, with_all_points
 from factorsfm.motion.at_rest import Rest
 from factorsfm.motion.moving import center_and_spread, log_errors
 from factorsfm.motion.readings import solution_from
 from factorsfm.motion.shot_kind import Motion, classify_motion
 from factorsfm.motion.suspects import agreeing
-from factorsfm.polish.camera_starts import best_solution, core_tracks
+from factorsfm.polish.camera_starts import best_solution, core_tracks, is_doubtful
 from factorsfm.polish.near_and_far import NearAndFar, near_and_far
 from factorsfm.polish.shot import Shot
 from factorsfm.polish.simple_readings import turning_reading, unless_at_rest
@@ -61,7 +61,7 @@ class Core:
 
     Attributes:
         points: rows of the core among all points; adjustment: converged over them.
-        moving, turns, rest, rival: see `Polished`.
+        moving, turns, rest, rival, zoom: see `Polished`.
     """
 
     points: Index
@@ -73,6 +73,7 @@ class Core:
     turns: bool
     rest: Rest | None
     rival: float
+    zoom: float
 
 
 def polish_start(
@@ -113,19 +114,24 @@ def _solved_core(shot: Shot, frames: list[int], observations: Observations, trac
     if found is None:
         found = unless_at_rest(best_solution(guess, few, options), guess, few, options)
     adjustment, few = found.adjustment, found.adjustment.observations
-    motion, lens, shutter = None, None, None
+    motion, lens, shutter, zoom = None, None, None, None
     if few.sweep is not None:
         motion = _motion(adjustment, found.rest, o)
         shutter = find_shutter(adjustment, motion, options)
     if shutter is not None:
         adjustment = solution_from(replace(adjustment.state, lens=shutter.lens.shape), few, options.polish)
     if options.estimates_lens:
-        adjustment, lens = _estimate_lens(adjustment, shot, frames, options, moves=not found.turns)
+        adjustment, lens, zoom = _estimate_lens(adjustment, shot, frames, options, moves=not found.turns)
         shutter = shutter and shutter.known_with(lens)
+    elif shot.in_time and is_doubtful(adjustment, options):
+        zoom = unannounced_zoom(adjustment, adjustment, shot.times(frames), options.polish, doubtful=True)
     if motion is None or lens is not None or shutter is not None:
         motion = _motion(adjustment, found.rest, o)
     moving = found.moving / len(core)
-    return Core(core[found.kept], adjustment, motion, lens, shutter, moving, found.turns, found.rest, found.rival)
+    suspected = 0.0 if zoom is None else zoom.ratio
+    return Core(
+        core[found.kept], adjustment, motion, lens, shutter, moving, found.turns, found.rest, found.rival, suspected
+    )  # fmt: skip
 
 
 def _motion(adjustment: BundleAdjustment, rest: Rest | None, options: PolishOptions) -> Motion:
@@ -173,17 +179,23 @@ def _estimate_lens(
     options: Options,
     *,
     moves: bool,
-) -> tuple[BundleAdjustment, LensEstimate]:
-    """As `estimate_lens`, with a focal length for every frame where a zoom is asked for and found."""
-    zoom = None
+) -> tuple[BundleAdjustment, LensEstimate, Zoom | None]:
+    """As `estimate_lens`, with a focal length for every frame where there is a zoom; and one that is only suspected."""
+    zoom, suspected, times = None, None, shot.times(frames)
     if options.lens == "zoom" and len(adjustment.state.log_focal) == 1:
-        zoom = find_zoom(adjustment, shot.times(frames), options.polish)
+        zoom = find_zoom(adjustment, times, options.polish)
     if zoom is None or not zoom.found:
-        adjustment, lens = estimate_lens(adjustment, options, first_focal=shot.first_focal, moves=moves)
-        return adjustment, replace(lens, zoom_std=zoom.std if zoom else None)
+        fixed, lens = estimate_lens(adjustment, options, first_focal=shot.first_focal, moves=moves)
+        if options.lens == "distortion" and shot.in_time and len(adjustment.state.log_focal) == 1:
+            doubtful = is_doubtful(fixed, options)
+            if moves or doubtful:
+                suspected = unannounced_zoom(adjustment, fixed, times, options.polish, doubtful=doubtful)
+        if suspected is None or not suspected.certain:
+            return fixed, replace(lens, zoom_std=zoom.std if zoom else None), suspected
+        zoom = suspected
     prior = FocalPrior(np.zeros(len(frames)), zoom.information)
     adjustment, lens = estimate_lens(zoom.adjustment, options, prior)
-    return adjustment, replace(lens, zoom_std=zoom.std)
+    return adjustment, replace(lens, zoom_std=zoom.std, announced=suspected is None), None
 
 
 # --- all tracks -------------------------------------------------------------------------------------------------

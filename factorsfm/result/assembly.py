@@ -16,6 +16,7 @@ from factorsfm.lens.camera_model import with_distortion
 from factorsfm.lens.lens import LensEstimate
 from factorsfm.lens.rolling_shutter import Shutter
 from factorsfm.mapping.mapped_images import MappedImage
+from factorsfm.motion.stretches import Stretch
 from factorsfm.polish.polished import Polished
 from factorsfm.priors.depth_map import DepthKind
 from factorsfm.result.frame_results import SourceFrame, frame_results
@@ -73,6 +74,7 @@ def assemble(
         observation_error=observations.error,
         prior_residual=observations.prior_residual,
         kind=polished.motion.kind,
+        stretches=tuple(Stretch(frames[s.first].index, frames[s.last].index, s.kind) for s in polished.stretches),
         parallax=parallax(camera_centers(state.rotation, state.translation), state.inverse_distance),
         point_std=polished.point_std[kept] / state.inverse_distance[kept] if general else None,
         noise=observations.noise,

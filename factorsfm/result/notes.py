@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from factorsfm.control.fit import ControlFit
 from factorsfm.lens.lens import LensEstimate
 from factorsfm.motion.shot_kind import LEAST_GAIN
+from factorsfm.motion.stretches import Stretch
 from factorsfm.polish.polished import Polished
 from factorsfm.result.reconstruction import FrameResult, Reconstruction, RollingShutter
 from factorsfm.support.status import ShotKind
@@ -82,7 +83,7 @@ def result_notes(
         depth_given: whether there is a depth prior; has_depth: whether a frame has a depth map.
         interval: seconds between two frames, 0 if unknown.
     """
-    notes = _motion_notes(polished, has_depth)
+    notes = _motion_notes(polished, has_depth) + stretch_notes(result.stretches)
     if polished.moving:
         notes.append(
             f"Something moves by itself: {100 * polished.moving:.0f} % of the longest tracks, which are left out. "
@@ -90,6 +91,11 @@ def result_notes(
         )
     if polished.lens is not None:
         notes.append(lens_note(polished.lens))
+    if polished.zoom:
+        notes.append(
+            f"The tracks ask for a zoom: one that changes the focal length by {polished.zoom:.2f} explains them far "
+            "better than one focal length; try --lens zoom."
+        )
     if polished.control is not None:
         notes += control_notes(polished.control)
     if polished.unused:
@@ -112,28 +118,47 @@ def result_notes(
 
 def _motion_notes(polished: Polished, has_depth: bool) -> list[str]:
     """What a camera that does not translate leaves open."""
-    motion = polished.motion
+    motion, zooms = polished.motion, polished.lens is not None and polished.lens.zooms
     depths = "depths and their scale come from the prior alone" if has_depth else "depths are unknown without a prior"
+    if motion.kind is ShotKind.STATIC and zooms:
+        return [f"The camera stays where it is and only zooms; {depths}."]
     if motion.kind is ShotKind.STATIC:
         return [f"The camera is static: no frame moves by more than {motion.displacement_px:.2f} pixels; {depths}."]
     if motion.kind is ShotKind.ROTATION:
         return [
-            "The camera only rotates: its translation is not observable from geometry and is reported as zero; "
+            f"The camera only {'rotates and zooms' if zooms else 'rotates'}: its translation is not observable from "
+            "geometry and is reported as zero; "
             f"{depths}."
         ]
     return []
+
+
+def stretch_notes(stretches: Sequence[Stretch]) -> list[str]:
+    """What the camera does when, of a shot that is not of one kind throughout."""
+    if len(stretches) < 2:
+        return []
+    does = {ShotKind.STATIC: "stands", ShotKind.ROTATION: "only turns", ShotKind.GENERAL: "moves"}
+    said = ", ".join(f"{does[s.kind]} in {s.first} to {s.last}" for s in stretches)
+    return [f"By frames, the camera {said}."]
 
 
 def lens_note(estimate: LensEstimate) -> str:
     """What the shot says of an unknown lens."""
     focals, std = estimate.lens.focal, f"standard deviation {100 * estimate.focal_std.max():.1f} %"
     focal, zoom, held = float(np.median(focals)), "", not estimate.focal_std.any()
-    if estimate.zoom_std is not None and len(focals) == 1:
+    if estimate.zoom_std is not None and not estimate.zooms:
         zoom = f" No zoom was found: what it might be is less than {200 * estimate.zoom_std:.1f} %."
-    elif estimate.zoom_std is not None:
+    elif estimate.zooms:
         zoom = (
             f" It changes from {focals[0]:.0f} to {focals[-1]:.0f} pixels; the ratio of the longest to the shortest is "
             f"{focals.max() / focals.min():.3f} ± {estimate.zoom_std * focals.max() / focals.min():.3f}."
+        )
+        if not estimate.announced:
+            zoom += " Nobody announced this zoom; --lens focal keeps one focal length."
+    if estimate.contradicted_px:
+        zoom += (
+            f" What was known of it before says {estimate.contradicted_px:.0f} pixels, which the images contradict: "
+            "cropped or stretched pictures, or a rolling shutter, may explain it."
         )
     if not (estimate.determined or estimate.rough):
         reason = f"this shot does not determine it ({std})"

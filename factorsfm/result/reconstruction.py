@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     import pycolmap
 from factorsfm.control.fit import ControlFit
 from factorsfm.inertial.fit import ImuFit
+from factorsfm.motion.stretches import Stretch
 from factorsfm.objects.object_result import ObjectResult
 from factorsfm.polish.observability import CameraObservability
 from factorsfm.support.status import FrameStatus, ShotKind
@@ -174,6 +175,7 @@ class Reconstruction:
         prior_residual: (m,) residual of the depth prior relative to the predicted inverse depth
             ``scale / z``, NaN for an observation without prior.
         kind: what the motion allows one to recover.
+        stretches: what the camera does when, in numbers of frames; empty where the images are in no order of time.
         parallax: largest camera displacement over the median point depth (paper, section 4).
         point_std: (n,) relative standard deviation of the inverse distance of each point from the first registered
             camera, with the scale fixed as in `FrameResult.covariance`; None if unknown.
@@ -215,6 +217,7 @@ class Reconstruction:
     imu: ImuFit | None = None
     doubts: list[str] = field(default_factory=list)
     objects: tuple[ObjectResult, ...] = ()
+    stretches: tuple[Stretch, ...] = ()
     notes: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
     options: dict[str, Any] = field(default_factory=dict)

@@ -36,6 +36,7 @@ def summary(reconstruction: Reconstruction) -> dict[str, Any]:
         "observations": len(reconstruction.observation_point),
         "parallax": reconstruction.parallax,
         "kind": reconstruction.kind,
+        "stretches": [{"frames": [s.first, s.last], "kind": s.kind} for s in reconstruction.stretches],
         "metric": reconstruction.metric,
         "control": reconstruction.control and asdict(reconstruction.control),
         "imu": reconstruction.imu and asdict(reconstruction.imu),

@@ -400,3 +400,12 @@ def test_a_match_that_is_seen_far_outside_of_the_image_says_nothing_of_the_disto
     std, other_std = (s[adjustment.columns.lens][:2] for s in (std, other_std))
     assert ((other_std / std > 0.7) & (other_std / std < 2.0)).all()
     assert (np.abs(beside_it - without) < 2.0 * std).all()
+
+
+@pytest.mark.parametrize(("first_std", "contradicted"), [(0.03, True), (0.3, False)])
+def test_a_focal_length_of_exif_data_that_the_images_contradict_is_told(first_std, contradicted):
+    problem = make_problem("arc", frames=10, points=200, parallax=0.3, noise_px=0.05)
+    result = estimated(problem, guess=1.25, first_std=first_std, lens="focal")
+    assert result.lens.lens.focal[0] == pytest.approx(problem.focal, rel=0.002)
+    assert result.lens.contradicted_px == pytest.approx(1.25 * problem.focal if contradicted else 0.0)
+    assert ("which the images contradict" in lens_note(result.lens)) == contradicted
