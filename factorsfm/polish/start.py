@@ -18,7 +18,7 @@ from factorsfm.lens.rolling_shutter import Shutter, find_shutter
 from factorsfm.lens.zoom import find_zoom
 from factorsfm.mapping.all_points import triangulated, with_all_points
 from factorsfm.motion.at_rest import Rest
-from factorsfm.motion.moving import center_and_spread, log_errors
+from factorsfm.motion.moving import center_and_spread, log_errors, moving_together
 from factorsfm.motion.readings import solution_from
 from factorsfm.motion.shot_kind import Motion, classify_motion
 from factorsfm.motion.suspects import agreeing
@@ -33,7 +33,6 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 _MANY_TRACKS = 0.3  # of the largest number of tracks in a frame
-_MOSTLY_MOVING = 0.4  # of the core: a median of all points would say nothing of the others
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +43,7 @@ class PolishStart:
         state: of cameras, lens and points; observations, tracks: that belong together.
         sigma: of the core tracks, pixels; inflation: of its square, since errors repeat themselves.
         depths: with the prior at the weight it earns; core: solved first.
+        moving: see `Polished`.
     """
 
     state: State
@@ -53,6 +53,7 @@ class PolishStart:
     inflation: float
     depths: NearAndFar
     core: Core
+    moving: Index
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +62,7 @@ class Core:
 
     Attributes:
         points: rows of the core among all points; adjustment: converged over them.
-        moving, turns, rest, rival: see `Polished`.
+        turns, rest, rival: see `Polished`.
     """
 
     points: Index
@@ -69,7 +70,6 @@ class Core:
     motion: Motion
     lens: LensEstimate | None
     shutter: Shutter | None
-    moving: float
     turns: bool
     rest: Rest | None
     rival: float
@@ -98,8 +98,10 @@ def polish_start(
 
     progress("polish: points")
     part = core.adjustment.state if general else core.motion.rotation_only
-    fitting = _with_fitting_tracks(part, core, observations, tracks, shot.suspects, options.polish)
-    return PolishStart(*fitting, core.adjustment.sigma, inflation, depths, core)
+    state, observations, tracks, moving = _with_fitting_tracks(
+        part, core, observations, tracks, shot.suspects, options.polish
+    )
+    return PolishStart(state, observations, tracks, core.adjustment.sigma, inflation, depths, core, moving)
 
 
 def _solved_core(shot: Shot, frames: list[int], observations: Observations, tracks: Index, options: Options) -> Core:
@@ -124,8 +126,7 @@ def _solved_core(shot: Shot, frames: list[int], observations: Observations, trac
         shutter = shutter and shutter.known_with(lens)
     if motion is None or lens is not None or shutter is not None:
         motion = _motion(adjustment, found.rest, o)
-    moving = found.moving / len(core)
-    return Core(core[found.kept], adjustment, motion, lens, shutter, moving, found.turns, found.rest, found.rival)
+    return Core(core[found.kept], adjustment, motion, lens, shutter, found.turns, found.rest, found.rival)
 
 
 def _motion(adjustment: BundleAdjustment, rest: Rest | None, options: PolishOptions) -> Motion:
@@ -191,8 +192,11 @@ def _estimate_lens(
 
 def _with_fitting_tracks(
     part: State, core: Core, observations: Observations, tracks: Index, suspects: Index, options: PolishOptions
-) -> tuple[State, Observations, Index]:
-    """All points for the cameras of `part`, and the tracks that fit them; of the suspects those that agree."""
+) -> tuple[State, Observations, Index, Index]:
+    """All points for the cameras of `part`, and the tracks that fit them; of the suspects those that agree.
+
+    The last of the result are the tracks that move by themselves.
+    """
     solved, points = core.adjustment, core.points
     with_ray = np.asarray(np.isfinite(solved.state.normalized(observations)).all(axis=1))
     if not with_ray.all():
@@ -203,25 +207,23 @@ def _with_fitting_tracks(
         state, observations, replace(options, iterations=4), solved.errors, free=Free(cameras=False)
     )
     state, errors = adjustment.solve(), adjustment.reprojection_errors()
-    agree = agreeing(observations, errors, np.isin(tracks, suspects))
-    if not agree.all():
-        kept = np.flatnonzero(agree)
-        state, tracks, errors = state.of(kept), tracks[kept], errors[agree[observations.point]]
-        points = np.searchsorted(kept, points)  # of the core, which has no suspects
+    moves = moving_together(observations, errors, points, solved.sigma)
+    scene, moving = agreeing(observations, errors, np.isin(tracks, suspects)) & ~moves, tracks[moves]
+    if not scene.all():
+        kept = np.flatnonzero(scene)
+        state, tracks, errors = state.of(kept), tracks[kept], errors[scene[observations.point]]
         observations = observations.of(kept)
     if options.observation_sigmas is None:
-        # Where most of the core is left out, what moves by itself is what is usual.
-        usual = points if core.moving > _MOSTLY_MOVING else np.arange(len(tracks))
-        kept = _usual_points(observations, errors, usual, options)
-        return state.of(kept), observations.of(kept), tracks[kept]
+        kept = _usual_points(observations, errors, options)
+        return state.of(kept), observations.of(kept), tracks[kept], moving
     observations, kept = _only(observations, errors < options.observation_sigmas * solved.sigma)
-    return state.of(kept), observations, tracks[kept]
+    return state.of(kept), observations, tracks[kept], moving
 
 
-def _usual_points(observations: Observations, errors: Array, usual: Index, options: PolishOptions) -> Index:
-    """Points whose typical error is not far outside that of the usual ones (log scale, robust)."""
+def _usual_points(observations: Observations, errors: Array, options: PolishOptions) -> Index:
+    """Points whose typical error is not far outside the usual (log scale, robust)."""
     typical = log_errors(observations, errors)
-    center, spread = center_and_spread(typical[usual])
+    center, spread = center_and_spread(typical)
     return np.nonzero(typical < center + options.outlier_sigmas * max(spread, 0.1))[0]
 
 
