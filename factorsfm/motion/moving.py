@@ -36,16 +36,22 @@ def standing_out(adjustment: BundleAdjustment) -> NDArray[np.bool_]:
 
 
 def moving_together(
-    observations: Observations, errors: NDArray[np.float64], rests_on: NDArray[np.int64], sigma: float
+    observations: Observations,
+    errors: NDArray[np.float64],
+    sigma: float,
+    *,
+    rests_on: NDArray[np.int64],
+    left_out: NDArray[np.int64],
 ) -> NDArray[np.bool_]:
     """(n,) which points move by themselves: a solution does not explain them at all, nor what is around them.
 
-    What slides along an edge stands out alone, a thing with all of its tracks: some are amid others that stand out, too,
+    What slides along an edge stands out alone, a thing with all of its tracks: some are amid others that stand out,
     and the rest beside these.
 
     Args:
-        errors: (m,) of the observations under cameras that rest on some of the points, pixels; sigma: of a coordinate
-            of these, pixels.
+        errors: (m,) of the observations under cameras that rest on some of the points, pixels.
+        sigma: of a coordinate of what they rest on, pixels.
+        rests_on: these points; left_out: points without which they fit better.
     """
     size = log_errors(observations, errors)
     found = _beyond(size, size[rests_on], sigma)
@@ -54,6 +60,7 @@ def moving_together(
     where = places(observations)
     inside = found.copy()
     inside[found] = share_nearby(where, found, found) > _INSIDE
+    inside[left_out] = found[left_out]
     found[found] = share_nearby(where, inside, found) > 0.0
     return np.asarray(found & (inside.sum() >= _LEAST))
 

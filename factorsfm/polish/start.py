@@ -62,10 +62,12 @@ class Core:
 
     Attributes:
         points: rows of the core among all points; adjustment: converged over them.
+        left_out: rows of the points without which it is.
         turns, rest, rival: see `Polished`.
     """
 
     points: Index
+    left_out: Index
     adjustment: BundleAdjustment
     motion: Motion
     lens: LensEstimate | None
@@ -126,7 +128,8 @@ def _solved_core(shot: Shot, frames: list[int], observations: Observations, trac
         shutter = shutter and shutter.known_with(lens)
     if motion is None or lens is not None or shutter is not None:
         motion = _motion(adjustment, found.rest, o)
-    return Core(core[found.kept], adjustment, motion, lens, shutter, found.turns, found.rest, found.rival)
+    kept, left_out = core[found.kept], np.delete(core, found.kept)
+    return Core(kept, left_out, adjustment, motion, lens, shutter, found.turns, found.rest, found.rival)
 
 
 def _motion(adjustment: BundleAdjustment, rest: Rest | None, options: PolishOptions) -> Motion:
@@ -197,18 +200,21 @@ def _with_fitting_tracks(
 
     The last of the result are the tracks that move by themselves.
     """
-    solved, points = core.adjustment, core.points
+    solved, points, left_out = core.adjustment, core.points, core.left_out
     with_ray = np.asarray(np.isfinite(solved.state.normalized(observations)).all(axis=1))
     if not with_ray.all():
         observations, kept = _only(observations, with_ray)
         tracks, points = tracks[kept], np.searchsorted(kept, points)
+        left_out = np.flatnonzero(np.isin(kept, left_out))
     state = with_all_points(part, solved.state, observations, points)
     adjustment = BundleAdjustment(
         state, observations, replace(options, iterations=4), solved.errors, free=Free(cameras=False)
     )
     state, errors = adjustment.solve(), adjustment.reprojection_errors()
-    moves = moving_together(observations, errors, points, solved.sigma)
-    scene, moving = agreeing(observations, errors, np.isin(tracks, suspects)) & ~moves, tracks[moves]
+    agree = agreeing(observations, errors, np.isin(tracks, suspects))
+    left_out = np.union1d(left_out, np.flatnonzero(~agree))
+    moves = moving_together(observations, errors, solved.sigma, rests_on=points, left_out=left_out)
+    scene, moving = agree & ~moves, tracks[moves]
     if not scene.all():
         kept = np.flatnonzero(scene)
         state, tracks, errors = state.of(kept), tracks[kept], errors[scene[observations.point]]

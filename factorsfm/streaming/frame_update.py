@@ -117,8 +117,8 @@ def frame_update(
     return FrameUpdate(
         frame.index, image.status, image.message, pose_of(image), image.keyframe, len(image.tracks.ids),
         image.inliers, mapper.new_points, mapper.parallax, image.covariance, _newest_prior(mapper, frames),
-        frame.dropped, focal_length=mapper.focal, focal_changed=focal_changed, starts_anew=mapper.starts_anew or mapper.begins_again,
-        note=mapper.note,
+        frame.dropped, focal_length=mapper.focal, focal_changed=focal_changed,
+        starts_anew=mapper.starts_anew or mapper.begins_again, note=mapper.note,
     )  # fmt: skip
 
 
