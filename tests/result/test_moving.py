@@ -3,15 +3,19 @@
 import json
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
 
+from factorsfm.export.other_footage import at_size_of
 from factorsfm.result.moving import Moving, MovingStretch, moving_in, moving_json, read_moving
 from factorsfm.result.notes import moving_note
+from factorsfm.result.reading import read_result
 from factorsfm.support.errors import InputError
 from factorsfm.tracks.image_tracks import ImageTracks
 from tests.estimation_problems import tracks_at
+from tests.exact_result import build
 
 WIDTH, HEIGHT = 640, 360
 FRAMES = 30
@@ -98,3 +102,18 @@ def test_a_damaged_file_is_refused(tmp_path, tracks, said):
     (tmp_path / "moving.json").write_text(json.dumps({"stretches": [], "tracks": tracks}))
     with pytest.raises(InputError, match=said):
         read_moving(tmp_path / "moving.json")
+
+
+def test_a_result_keeps_it_and_gives_it_at_the_size_of_the_footage(tmp_path):
+    found = Moving((MovingStretch(10, 14, 0.2, 0.1),), np.array([10, 12]), np.array([0, 0]), np.array([[1.0, 2.0]] * 2))
+    result = replace(build(), moving=found)
+    result.write(tmp_path / "result")
+    again = read_result(tmp_path / "result")
+    assert again.moving is not None
+    assert again.moving.stretches == found.stretches
+    cv2.imwrite(str(tmp_path / "10.png"), np.zeros((960, 1280, 3), np.uint8))
+    larger = at_size_of(again, tmp_path).moving
+    assert larger is not None
+    np.testing.assert_allclose(larger.xy, [[2.5, 4.5]] * 2)
+    build().write(tmp_path / "result")
+    assert read_result(tmp_path / "result").moving is None
