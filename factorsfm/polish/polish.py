@@ -178,7 +178,7 @@ def _solved(
         frames, adjustment.state, start.tracks, start.observations, adjustment.reprojection_errors(), start.sigma,
         *adjustment.observation_sigmas(), start.core.motion, *_pose_covariances(covariance, adjustment.state),
         camera_observability(adjustment, marginals, covariance), point_std,
-        left_out, prior, start.core.lens, start.core.shutter, moving=start.core.moving, turns=start.core.turns,
+        left_out, prior, start.core.lens, start.core.shutter, moving=start.moving, turns=start.core.turns,
         rest=start.core.rest, rival=start.core.rival, zoom=start.core.zoom,
         inflation=start.inflation, contradiction=start.depths.correlation,
     )  # fmt: skip

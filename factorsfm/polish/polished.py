@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,7 +45,7 @@ class Polished:
             where such a camera would have it (pixels), None where they are not.
         shutter_error: median reprojection error with the rolling shutter in the model (pixels); NaN where poses are not
             `recorded`.
-        moving: share of the longest tracks that move by themselves and are left out.
+        moving: ids (ascending) of the tracks that move by themselves and are left out.
         turns: whether a camera that only turns explains the tracks through a lens of its own, see `turning_reading`.
         rest: what rests in the image while other things move, None where nothing does.
         rival: cost of this reading of the shot over that of the next best one in which something else is the scene; 0
@@ -79,7 +79,7 @@ class Polished:
     recorded: bool = False
     rolled: Array | None = None
     shutter_error: float = np.nan
-    moving: float = 0.0
+    moving: Index = field(default_factory=lambda: np.zeros(0, np.int64))
     turns: bool = False
     rest: Rest | None = None
     rival: float = 0.0

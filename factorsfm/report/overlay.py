@@ -1,4 +1,4 @@
-"""The overlay: the footage with tracked points, a grid and cubes locked into the scene, as a video."""
+"""The overlay: the footage with its tracks, and a grid and cubes locked into the scene, as a video."""
 
 from __future__ import annotations
 
@@ -28,14 +28,16 @@ Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 CODECS = {".mp4": "mp4v", ".mov": "mp4v", ".avi": "MJPG"}
-LAYERS = ("grid", "cubes", "points")
+LAYERS = ("grid", "cubes", "points", "moving")
 
 _SUBPIXEL = 4  # fractional bits of OpenCV's drawing coordinates
 _GRID, _EDGE = (255, 200, 90), (30, 30, 30)
 _CUBES = ((60, 150, 250), (190, 110, 220), (110, 190, 90))
 _GOOD, _POOR, _LOST = np.array([90, 220, 60.0]), np.array([40, 40, 255.0]), (60, 60, 255)
+_MOVING = (255, 40, 255)
 _POOR_PX = 1.0  # reprojection error of a point that is drawn in red
 _FACES = np.array([[0, 1, 2, 3], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])
+_UPRIGHT, _DIAGONAL = np.eye(2), np.array([[0.7, 0.7], [0.7, -0.7]])  # ends of the arms of a cross
 _SIDE = np.linspace(0, 1, 9)[:-1, None]  # a side of a face is drawn in parts, since a lens bends it
 _MARGIN = 1.3  # times the image's field of view: beyond it lens models go astray
 
@@ -96,7 +98,7 @@ def write_overlay(
         path: .mp4, .mov or .avi (JPEG pictures: larger and better). An odd width or height gains a pixel, since the
             codecs need even ones.
         source: the shot, as `ExportOptions.footage`; None takes the source of the reconstruction.
-        hide: of "grid", "cubes", "points".
+        hide: of "grid", "cubes", "points", "moving".
         progress: called with the stage, the frames done, and their number.
 
     Returns:
@@ -164,6 +166,9 @@ def draw_overlay(
         if "points" in layers:
             mine = reconstruction.observation_frame == position
             _draw_points(canvas, reconstruction.observation_xy[mine], reconstruction.observation_error[mine])
+    if (moving := reconstruction.moving) is not None and "moving" in layers:
+        _draw_crosses(canvas, moving.xy[moving.frame == frame.index], _MOVING, _DIAGONAL)
+        _draw_legend(canvas)
     _label(canvas, frame)
     return canvas
 
@@ -212,21 +217,42 @@ def _draw_cubes(canvas: Image, props: Props, pose: pycolmap.Rigid3d, projector: 
 
 def _draw_points(canvas: Image, xy: Array, error: Array) -> None:
     """A cross where each point is tracked: green where the solve agrees, red where it misses it by a pixel."""
-    arm = 2.0 + canvas.shape[1] / 800
     share = np.clip(np.nan_to_num(error, nan=_POOR_PX) / _POOR_PX, 0, 1)[:, None]
-    for (x, y), color in zip(xy, (_GOOD + share * (_POOR - _GOOD)).tolist(), strict=True):
-        for ends in ([[x - arm, y], [x + arm, y]], [[x, y - arm], [x, y + arm]]):
-            cv2.polylines(canvas, [_fixed(np.array(ends))], False, color, 1, cv2.LINE_AA, _SUBPIXEL)
+    for place, color in zip(xy, (_GOOD + share * (_POOR - _GOOD)).tolist(), strict=True):
+        _draw_crosses(canvas, place[None], color, _UPRIGHT)
+
+
+def _draw_crosses(canvas: Image, xy: Array, color: Sequence[float], arms: Array) -> None:
+    """A cross at each place (n, 2), of two arms (2, 2) that are given for one of them by its end."""
+    size = 2.0 + canvas.shape[1] / 800
+    for arm in size * arms:
+        lines = _fixed(xy[:, None] + [-arm, arm])
+        cv2.polylines(canvas, list(lines), False, color, 1, cv2.LINE_AA, _SUBPIXEL)
+
+
+def _draw_legend(canvas: Image) -> None:
+    """Which crosses are which, in the lower left corner."""
+    size = canvas.shape[1] / 1600 + 0.2
+    step, left = round(30 * size), 14
+    for line, (text, color, arms) in enumerate(
+        (("moves by itself", _MOVING, _DIAGONAL), ("tracked in the scene", _GOOD.tolist(), _UPRIGHT))
+    ):
+        y = canvas.shape[0] - 14 - step * line
+        _draw_crosses(canvas, np.array([[left, y - 8 * size]]), color, arms)
+        _write(canvas, text, (round(left + 18 * size), y), size, color)
 
 
 def _label(canvas: Image, frame: FrameResult) -> None:
     size = canvas.shape[1] / 1600 + 0.2
     color = (255, 255, 255) if frame.registered else _LOST
     text = f"{frame.index}" if frame.registered else f"{frame.index}: {status_words(frame.status)}"
+    _write(canvas, text, (10, round(12 + 24 * size)), size, color)
+
+
+def _write(canvas: Image, text: str, at: tuple[int, int], size: float, color: Sequence[float]) -> None:
+    """A text with a dark rim, from its lower left corner on."""
     for ink, thickness in (((0, 0, 0), 3), (color, 1)):
-        cv2.putText(
-            canvas, text, (10, round(12 + 24 * size)), cv2.FONT_HERSHEY_SIMPLEX, size, ink, thickness, cv2.LINE_AA
-        )
+        cv2.putText(canvas, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, ink, thickness, cv2.LINE_AA)
 
 
 def _visible(line: Array) -> list[Array]:

@@ -104,7 +104,19 @@ def _facts(reconstruction: Reconstruction) -> dict[str, Any]:
         "Scale": "metres" if reconstruction.metric else "free",
         "Focal length": f"{focals[0]:.1f} to {focals[1]:.1f} px" if focals else f"{camera.mean_focal_length():.1f} px",
         "Lens": f"{camera.model_name} {camera.width}×{camera.height}",
-    } | _object_facts(reconstruction)
+        **_moving_facts(reconstruction),
+        **_object_facts(reconstruction),
+    }
+
+
+def _moving_facts(reconstruction: Reconstruction) -> dict[str, Any]:
+    """A line on what moves by itself, where something does."""
+    moving = reconstruction.moving
+    return (
+        {"Moves by itself": f"up to {100 * max(s.image for s in moving.stretches):.0f} % of the image"}
+        if moving
+        else {}
+    )
 
 
 def _motion(reconstruction: Reconstruction) -> str:

@@ -14,14 +14,14 @@ from factorsfm.lens.lens import LensEstimate
 from factorsfm.motion.shot_kind import LEAST_GAIN
 from factorsfm.motion.stretches import Stretch
 from factorsfm.polish.polished import Polished
+from factorsfm.result.moving import Moving
 from factorsfm.result.reconstruction import FrameResult, Reconstruction, RollingShutter
+from factorsfm.result.runs import runs
 from factorsfm.support.status import ShotKind
 
 # Worth a sentence: the prior gives at least half of the information, or a virtual object may visibly drift.
 _NOTED_SHARE = 0.5
 _NOTED_SLIDE_PX = 0.5
-_MERGED_GAP = 5  # registered frames between two weak stretches that are told as one
-_SHORTEST_STRETCH = 3  # frames
 _MOST_STRETCHES = 2  # sentences of each sort
 _AS_GOOD = 0.9  # cost over that of another reading, from which that is nearly as good
 # Of the variance, since errors of neighbouring tracks are alike: right solutions have 1 to 7, wrong ones 13 to 80.
@@ -84,11 +84,8 @@ def result_notes(
         interval: seconds between two frames, 0 if unknown.
     """
     notes = _motion_notes(polished, has_depth) + stretch_notes(result.stretches)
-    if polished.moving:
-        notes.append(
-            f"Something moves by itself: {100 * polished.moving:.0f} % of the longest tracks, which are left out. "
-            "Masks of it make the cameras better still."
-        )
+    if result.moving is not None:
+        notes.append(moving_note(result.moving))
     if polished.lens is not None:
         notes.append(lens_note(polished.lens))
     if polished.zoom:
@@ -140,6 +137,21 @@ def stretch_notes(stretches: Sequence[Stretch]) -> list[str]:
     does = {ShotKind.STATIC: "stands", ShotKind.ROTATION: "only turns", ShotKind.GENERAL: "moves"}
     said = ", ".join(f"{does[s.kind]} in {s.first} to {s.last}" for s in stretches)
     return [f"By frames, the camera {said}."]
+
+
+def moving_note(moving: Moving) -> str:
+    """How much of the shot moves by itself, and when."""
+    told = sorted(sorted(moving.stretches, key=lambda s: -s.image)[:_MOST_STRETCHES], key=lambda s: s.first)
+    said = [
+        f"frames {s.first} to {s.last}: {100 * s.tracks:.0f} % of the tracks, {100 * s.image:.0f} % of the image"
+        for s in told
+    ]
+    others = len(moving.stretches) - len(told)
+    more = f"; {others} other {'stretch' if others == 1 else 'stretches'} in summary.json" if others else ""
+    return (
+        f"Something moves by itself and is left out: {'; '.join(said)}{more}. "
+        "Masks of all that moves make the cameras better still."
+    )
 
 
 def lens_note(estimate: LensEstimate) -> str:
@@ -255,12 +267,12 @@ def observability_notes(frames: Sequence[FrameResult]) -> list[str]:
             f"{(1.0 - min(typical, 0.9999)) ** -0.5:.2g} times the error."
         )
         weak &= not weak.all()
-    for stretch in _stretches(weak, view_axis):
+    for stretch in _weakest(weak, view_axis):
         notes.append(
             f"{_frames(index[stretch])}: translation along the view axis comes "
             f"{100 * np.median(view_axis[stretch]):.0f} % from the depth prior."
         )
-    for stretch in _stretches(slide >= _NOTED_SLIDE_PX, slide):
+    for stretch in _weakest(slide >= _NOTED_SLIDE_PX, slide):
         notes.append(
             f"{_frames(index[stretch])}: a virtual object at the scene's median depth may drift by "
             f"{slide[stretch].max():.1f} pixels (one standard deviation)."
@@ -268,13 +280,10 @@ def observability_notes(frames: Sequence[FrameResult]) -> list[str]:
     return notes
 
 
-def _stretches(weak: NDArray[np.bool_], values: NDArray[np.float64]) -> list[slice]:
-    """The few runs of weak frames with the largest values, in order; runs with a short gap between are one."""
-    rows = np.nonzero(weak)[0]
-    runs = np.split(rows, np.nonzero(np.diff(rows) > _MERGED_GAP + 1)[0] + 1)
-    stretches = [slice(run[0], run[-1] + 1) for run in runs if len(run) >= min(_SHORTEST_STRETCH, len(weak))]
-    stretches.sort(key=lambda stretch: -np.median(values[stretch]))
-    return sorted(stretches[:_MOST_STRETCHES], key=lambda stretch: stretch.start)
+def _weakest(weak: NDArray[np.bool_], values: NDArray[np.float64]) -> list[slice]:
+    """The few stretches of weak frames with the largest values, in order."""
+    found = sorted(runs(weak), key=lambda stretch: -np.median(values[stretch]))
+    return sorted(found[:_MOST_STRETCHES], key=lambda stretch: stretch.start)
 
 
 def _frames(index: NDArray[np.int64]) -> str:

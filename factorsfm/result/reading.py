@@ -17,6 +17,7 @@ from factorsfm.control.fit import ControlFit
 from factorsfm.inertial.fit import ImuFit
 from factorsfm.motion.stretches import Stretch
 from factorsfm.polish.observability import CameraObservability
+from factorsfm.result.moving import read_moving
 from factorsfm.result.objects import read_objects
 from factorsfm.result.reconstruction import FrameResult, LensFit, PriorFit, Reconstruction, RollingShutter
 from factorsfm.result.summary import part_name
@@ -100,6 +101,7 @@ def read_result(directory: str | Path) -> Reconstruction:
         summary = typed(_Summary, content, "summary.json")
         result = _reconstruction(summary, pycolmap.Reconstruction(directory / "colmap"))
         result.objects = read_objects(directory / "objects.json")
+        result.moving = read_moving(directory / "moving.json")
     except (InputError, OSError, ValueError, LookupError, RuntimeError) as error:
         raise InputError(f"the result in {directory} is damaged: {error}") from error
     result.others = [read_result(directory / part_name(number)) for number in range(2, summary.parts + 1)]

@@ -17,6 +17,7 @@ from factorsfm.inertial.fit import ImuFit
 from factorsfm.motion.stretches import Stretch
 from factorsfm.objects.object_result import ObjectResult
 from factorsfm.polish.observability import CameraObservability
+from factorsfm.result.moving import Moving
 from factorsfm.support.status import FrameStatus, ShotKind
 
 
@@ -187,6 +188,8 @@ class Reconstruction:
         metric: whether the world unit is the metre (from a metric prior, or from control).
         control: how well the control is met, or factors that were added; None without either.
         imu: what an IMU has given, None without one that took part.
+        moving: what moves by itself, left out of all else; None where nothing was found. What a mask covers was never
+            looked at.
         doubts: why the images leave open what the camera does, in sentences; empty where they do not.
         objects: things that move by themselves and were asked for, as far as they could be solved.
         notes: sentences for the user (translation unobservable, focal length guessed, ...).
@@ -215,6 +218,7 @@ class Reconstruction:
     metric: bool = False
     control: ControlFit | None = None
     imu: ImuFit | None = None
+    moving: Moving | None = None
     doubts: list[str] = field(default_factory=list)
     objects: tuple[ObjectResult, ...] = ()
     stretches: tuple[Stretch, ...] = ()

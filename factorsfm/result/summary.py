@@ -40,6 +40,7 @@ def summary(reconstruction: Reconstruction) -> dict[str, Any]:
         "metric": reconstruction.metric,
         "control": reconstruction.control and asdict(reconstruction.control),
         "imu": reconstruction.imu and asdict(reconstruction.imu),
+        "moving": [asdict(stretch) for stretch in reconstruction.moving.stretches] if reconstruction.moving else [],
         "objects": [_object_json(found) for found in reconstruction.objects],
         "reprojection_error": median_reprojection_error(reconstruction),
         "observability": pooled_observability(reconstruction),
