@@ -7,7 +7,7 @@ side, and is there in every frame. What is dark in the picture does all of that 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import cv2
 import numpy as np
@@ -38,10 +38,8 @@ class BarDetector:
     def push(self, grey: NDArray[np.uint8]) -> PictureArea | None:
         """The picture of a (h, w) frame and all before it; None if it fills the image."""
         height, width = grey.shape
-        above = _above_bars(grey)
-        if above is not None:
-            for side, found in zip(self._sides, _edges(above), strict=True):
-                side.add(*found)
+        for side, lines in zip(self._sides, _edges(grey), strict=False):
+            side.add(*lines)
         left, right, top, bottom = (side.width for side in self._sides)
         if (left == 0) != (right == 0) and left + right > _ALONE * width:
             left = right = 0
@@ -51,42 +49,46 @@ class BarDetector:
             return None
         return PictureArea(left, top, width - right, height - bottom)
 
-    def state(self) -> list[tuple[int | None, int]]:
+    def state(self) -> list[tuple[int | None, int, bool]]:
         """What `restore` needs."""
-        return [(side.nearest, side.width) for side in self._sides]
+        return [astuple(side) for side in self._sides]
 
-    def restore(self, state: list[tuple[int | None, int]]) -> None:
+    def restore(self, state: list[tuple[int | None, int, bool]]) -> None:
         """Go on where `state` was taken."""
-        self._sides = [_Side(nearest, width) for nearest, width in state]
+        self._sides = [_Side(*side) for side in state]
 
 
 @dataclass(slots=True)
 class _Side:
-    """One side of the images: fewest dark lines of a frame, and how many of them are a bar."""
+    """One side of the images.
+
+    Attributes:
+        nearest: fewest dark lines of a frame; width: how many of them are a bar; entered: whether the picture has been
+            seen in what was taken for a bar.
+    """
 
     nearest: int | None = None
     width: int = 0
+    entered: bool = False
 
     def add(self, dark: int, is_edge: bool) -> None:
         """Take a frame with so many dark lines; is_edge: whether these end along one line."""
         self.nearest = dark if self.nearest is None else min(self.nearest, dark)
-        if self.width > self.nearest + _EDGE_PX:
-            self.width = 0  # the picture is seen where the bar was
+        self.entered |= self.width > self.nearest + _EDGE_PX
+        if self.entered:
+            self.width = 0
         elif is_edge and _LEAST_PX <= dark <= self.nearest + _EDGE_PX:
             self.width = max(self.width, dark)
 
 
-def _above_bars(grey: NDArray[np.uint8]) -> NDArray[np.uint8] | None:
-    """(h, w) grey levels over that of the bars; None if no border is dark, or nothing is lit."""
+def _edges(grey: NDArray[np.uint8]) -> list[tuple[int, bool]]:
+    """Of left, right, top and bottom: how many lines are dark, and whether they end along one line; [] if all are."""
     level = min(float(np.median(border)) for border in (grey[0], grey[-1], grey[:, 0], grey[:, -1]))
     if level > _BRIGHTEST_BAR:
-        return None
-    above = cv2.subtract(grey, level)
-    return np.asarray(above, np.uint8) if (above > _LIT).any() else None
-
-
-def _edges(above: NDArray[np.uint8]) -> list[tuple[int, bool]]:
-    """Of left, right, top and bottom: how many lines are dark, and whether they end along one line."""
+        return [(0, False)] * 4
+    above = np.asarray(cv2.subtract(grey, level), np.uint8)
+    if not (above > _LIT).any():
+        return []
     height, width = above.shape
     columns = above[:: max(1, height // _COMPARED)].T
     rows = above[:, :: max(1, width // _COMPARED)]

@@ -97,6 +97,37 @@ def test_uneven_times_are_kept(tmp_path):
     assert [frame.timestamp for frame in read_frames(path)] == pytest.approx(np.array(times) / 100, abs=1e-3)
 
 
+def test_a_file_that_grows_is_read_as_far_as_it_was_and_warned_of(tmp_path, caplog):
+    path = write_video(tmp_path / "shot.ts", moving_texture(40), "mpeg2video")
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    frames = read_frames(path)
+    next(frames)
+    count = 1 + sum(1 for _ in frames)
+    assert not caplog.messages
+    path.write_bytes(data[: len(data) // 2])
+    frames = read_frames(path)
+    next(frames)
+    with path.open("ab") as file:
+        file.write(data[len(data) // 2 :])
+    assert count <= 1 + sum(1 for _ in frames) <= 40
+    assert any("more was written to it while it was read" in message for message in caplog.messages)
+
+
+def test_a_file_that_vanishes_with_its_network_is_no_shorter_file(tmp_path, monkeypatch):
+    path = write_video(tmp_path / "shot.mkv", moving_texture(30), **LOSSLESS)
+    frames = read_frames(path)
+    next(frames)
+
+    def fail(_: object) -> None:
+        raise av.error.OSError(5, "Input/output error")
+
+    monkeypatch.setattr("factorsfm.frames.video._packet_frames", fail)
+    path.unlink()
+    with pytest.raises(InputError, match=r"shot\.mkv cannot be read any more: No such file"):
+        list(frames)
+
+
 # --- fields -------------------------------------------------------------------------------------------------------
 
 
