@@ -10,32 +10,21 @@ import pytest
 from factorsfm.frames.ranges import parse_range
 from factorsfm.frames.reading import read_frames
 from factorsfm.support.errors import InputError
-from tests.video_files import BT709, BT2020, FULL, HLG, LIMITED, PQ, interlaced, moving_texture, woven, write_video
+from tests.video_files import (
+    BT709,
+    BT2020,
+    FORMATS,
+    FULL,
+    HLG,
+    LIMITED,
+    PQ,
+    interlaced,
+    moving_texture,
+    woven,
+    write_video,
+)
 
 LOSSLESS = {"codec": "ffv1", "pixels": "bgr0"}
-QUIET_H265 = {"x265-params": "log-level=none"}
-DNXHR = {"profile": "dnxhr_hq"}
-
-# suffix, codec, pixels, options: what cameras, phones, editors and the web hand out.
-FORMATS = [
-    (".mp4", "libx264", "yuv420p", {}),
-    (".mp4", "libx265", "yuv420p10le", QUIET_H265),
-    (".mov", "prores_ks", "yuv422p10le", {}),
-    (".mov", "prores_ks", "yuva444p10le", {"profile": "4444"}),
-    (".mov", "dnxhd", "yuv422p", DNXHR),
-    (".mxf", "dnxhd", "yuv422p", DNXHR),
-    (".mxf", "mpeg2video", "yuv422p", {}),
-    (".mkv", "libx264", "yuv420p10le", {}),
-    (".webm", "libvpx-vp9", "yuv420p", {}),
-    (".mpg", "mpeg2video", "yuv420p", {}),
-    (".m2ts", "libx264", "yuv420p", {}),
-    (".ts", "mpeg2video", "yuv420p", {}),
-    (".avi", "mjpeg", "yuvj420p", {}),
-    (".avi", "mpeg4", "yuv420p", {}),
-    (".wmv", "wmv2", "yuv420p", {}),
-    (".mkv", "ffv1", "bgr0", {}),
-    (".gif", "gif", "gray", {}),
-]
 
 
 def grey(image: np.ndarray) -> np.ndarray:
