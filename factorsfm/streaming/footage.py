@@ -74,11 +74,11 @@ class Footage:
         self._picture, self._shape = self._bars.push(grey), grey.shape
         return replace(frame, picture=self._picture), grey
 
-    def ignored(self, mask: NDArray[np.bool_] | None, window_px: int) -> NDArray[np.bool_] | None:
-        """The mask of the newest frame with its bars, so that no window of a track reaches into them."""
+    def ignored(self, mask: NDArray[np.bool_] | None, border_px: int) -> NDArray[np.bool_] | None:
+        """The mask of the newest frame with its bars, to which tracks keep their distance as to the border."""
         if self._picture is None:
             return mask
-        bars = self._picture.outside(self._shape, window_px // 2 + 1)
+        bars = self._picture.outside(self._shape, border_px)
         return bars if mask is None else mask | bars
 
     def repeated(self, frame: Frame, grey: NDArray[np.uint8], taken: int) -> FrameUpdate | None:

@@ -133,7 +133,7 @@ class Stream(Closing):
         check_size(frame, self._size)
         frame, grey = self._footage.seen(frame)
         with self.seconds.of("masks"):
-            mask = self._footage.ignored(read_mask(self._suspicion.sure, frame), self.options.tracker.window_px)
+            mask = self._footage.ignored(read_mask(self._suspicion.sure, frame), self.options.tracker.border_px)
         if (repeated := self._footage.repeated(frame, grey, len(self.frames))) is not None:
             return repeated
         with self.seconds.of("tracking"):

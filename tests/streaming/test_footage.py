@@ -121,8 +121,8 @@ def test_bars_cost_nothing(in_bars):
     _, expected = solved(pictures, cut)
     _, result = solved(barred)
     y = result.observation_xy[:, 1]
-    assert y.min() > 36 + 10
-    assert y.max() < 149 - 10
+    assert y.min() > 36 + 4
+    assert y.max() < 149 - 4
     error, without = (np.sqrt(np.mean(errors_of(r, shot).ate ** 2)) for r in (result, expected))
     assert error < 2 * without
     assert (
