@@ -134,9 +134,13 @@ def find_videos(source: Path, fields: Fields = "auto") -> list[Video]:
     stems = Counter(path.stem.lower() for path in paths)
     videos = []
     for path in paths:
-        status = path.stat()
         name = path.stem if stems[path.stem.lower()] == 1 else path.name
-        videos.append(Video(path.resolve(), name, status.st_size, status.st_mtime_ns, fields))
+        try:
+            status = path.stat()
+        except OSError:  # a link that leads nowhere; whoever reads it says so, and the other videos go on
+            videos.append(Video(path.absolute(), name, 0, 0, fields))
+        else:
+            videos.append(Video(path.resolve(), name, status.st_size, status.st_mtime_ns, fields))
     return videos
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from factorsfm.camera.projection import PIXEL_CENTER
 from factorsfm.export.options import ExportOptions
-from factorsfm.export.shot import Defaults, Shot, make_shot
+from factorsfm.export.shot import Defaults, Lens, Shot, make_shot
 from factorsfm.export.writing import complete_file
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.reading import read_frames
@@ -95,8 +95,8 @@ def write_overlay(
     """Write the footage with what is locked into the scene drawn over it, one picture a frame of the reconstruction.
 
     Args:
-        path: .mp4, .mov or .avi (JPEG pictures: larger and better). An odd width or height gains a pixel, since the
-            codecs need even ones.
+        path: .mp4, .mov or .avi (JPEG pictures: larger and better). Its pixels are square: squeezed footage is
+            stretched. An odd width or height gains a pixel, since the codecs need even ones.
         source: the shot, as `ExportOptions.footage`; None takes the source of the reconstruction.
         hide: of "grid", "cubes", "points", "moving".
         progress: called with the stage, the frames done, and their number.
@@ -119,11 +119,12 @@ def write_overlay(
         raise InputError("the source of this result is not where it was; say where the shot is")
     reconstruction = shot.reconstruction  # in its own world, at the size of the footage
     props, projector = place_props(reconstruction), Projector.of(reconstruction)
-    camera, frames = reconstruction.camera, reconstruction.frames
+    frames = reconstruction.frames
     step = np.median(np.diff([frame.index for frame in frames])) if len(frames) > 1 else 1
     layers = [layer for layer in LAYERS if layer not in hide]
     with complete_file(path) as file:
-        even = camera.width + camera.width % 2, camera.height + camera.height % 2
+        shown = _unsqueezed(shot.lens)
+        even = shown[0] + shown[0] % 2, shown[1] + shown[1] % 2
         video = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*CODECS[path.suffix.lower()]), shot.fps / step, even)
         if not video.isOpened():
             raise InputError(f"OpenCV cannot write the video {path}")
@@ -132,13 +133,22 @@ def write_overlay(
                 if progress is not None:
                     progress("overlay", position, len(frames))
                 image = draw_overlay(reconstruction, position, frame.image, props, projector, layers)
-                right, below = even[0] - camera.width, even[1] - camera.height
+                image = (
+                    image if shown == image.shape[1::-1] else cv2.resize(image, shown, interpolation=cv2.INTER_CUBIC)
+                )
+                right, below = even[0] - shown[0], even[1] - shown[1]
                 video.write(cv2.copyMakeBorder(image, 0, below, 0, right, cv2.BORDER_REPLICATE))
         finally:
             video.release()
         if (kept := count_frames(file)) < len(frames):  # OpenCV says nothing of a full disk
             raise OSError(f"only {kept} of {len(frames)} frames are in the file; is the disk full?")
     return props
+
+
+def _unsqueezed(lens: Lens) -> tuple[int, int]:
+    """Width and height of the picture in square pixels: no line or column is lost."""
+    aspect = lens.nominal_aspect
+    return round(lens.width * max(aspect, 1.0)), round(lens.height * max(1.0 / aspect, 1.0))
 
 
 def draw_overlay(

@@ -154,9 +154,14 @@ def moving_note(moving: Moving) -> str:
     )
 
 
+def _percent(share: float) -> str:
+    """A relative standard deviation in words; beyond 100 % a linear estimate has no digits that mean anything."""
+    return f"{100 * share:.1f} %" if share <= 1.0 else "of more than 100 %"
+
+
 def lens_note(estimate: LensEstimate) -> str:
     """What the shot says of an unknown lens."""
-    focals, std = estimate.lens.focal, f"standard deviation {100 * estimate.focal_std.max():.1f} %"
+    focals, std = estimate.lens.focal, f"standard deviation {_percent(estimate.focal_std.max())}"
     focal, zoom, held = float(np.median(focals)), "", not estimate.focal_std.any()
     if estimate.zoom_std is not None and not estimate.zooms:
         zoom = f" No zoom was found: what it might be is less than {200 * estimate.zoom_std:.1f} %."

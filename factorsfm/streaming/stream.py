@@ -9,7 +9,6 @@ from dataclasses import astuple
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
@@ -131,9 +130,9 @@ class Stream(Closing):
         mapper = self._mapper = self._mapper or self._open(frame)
         focal_changed = self._follow_focal(mapper)
         check_size(frame, self._size)
+        frame, grey = self._footage.seen(frame)
         with self.seconds.of("masks"):
-            mask = read_mask(self._suspicion.sure, frame)
-        grey = np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY), np.uint8)
+            mask = self._footage.ignored(read_mask(self._suspicion.sure, frame), self.options.tracker.border_px)
         if (repeated := self._footage.repeated(frame, grey, len(self.frames))) is not None:
             return repeated
         with self.seconds.of("tracking"):
