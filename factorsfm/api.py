@@ -3,36 +3,33 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
-import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
 from factorsfm.camera.files import open_camera
-from factorsfm.control.known import Control, find_frames, read_control
+from factorsfm.control.known import Control, read_control
 from factorsfm.frames.edits import AnotherView, LeftOut, left_out_of, read_edit, until_another_view
 from factorsfm.frames.fields import Fields
-from factorsfm.frames.folders import list_images
 from factorsfm.frames.frame import Frame
-from factorsfm.frames.numbering import chosen, missing_numbers, numbered_images, sequence_of
-from factorsfm.frames.ranges import checked_range, range_text
-from factorsfm.frames.reading import check_footage, read_frames
+from factorsfm.frames.numbering import missing_numbers, sequence_of
+from factorsfm.frames.ranges import checked_range
+from factorsfm.frames.reading import check_footage
 from factorsfm.frames.unordered import looks_unordered, other_files, read_images
 from factorsfm.imagesets.image_set import ImageSet
 from factorsfm.imagesets.photo_folder import work_folder
 from factorsfm.inertial.mounting import open_imu
 from factorsfm.inertial.recording import ImuRecording
+from factorsfm.inputs import Inputs, Source
 from factorsfm.objects.observed import ObservedObjects, RememberedDepth
-from factorsfm.priors.depth import DepthFolder, DepthPrior, open_depth
+from factorsfm.priors.depth import DepthPrior, open_depth
 from factorsfm.priors.depth_map import DepthKind
-from factorsfm.priors.masks import MaskFolder, MaskPrior, open_masks
-from factorsfm.priors.object_masks import FROM_MOTION, ObjectFolder, ObjectMasks, open_objects
+from factorsfm.priors.masks import MaskPrior, open_masks
+from factorsfm.priors.object_masks import FROM_MOTION, ObjectMasks, open_objects
 from factorsfm.result.left_out import add_left_out
 from factorsfm.result.objects import add_objects, seen_again
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
@@ -45,7 +42,7 @@ from factorsfm.support.threads import OneThreadEach
 
 
 def reconstruct(
-    source: str | Path | Iterable[Frame | NDArray[np.uint8]],
+    source: Source,
     *,
     camera: str | Path | pycolmap.Camera | None = None,
     depth: str | Path | DepthPrior | None = "tcmonodepth",
@@ -102,41 +99,30 @@ def reconstruct(
     _check_choice("lens", lens, get_args(LensFreedom))
     _check_choice("shutter", shutter, get_args(ShutterUse))
     check_footage(fields, pixel_aspect)
-    options = replace(Options.preset_named(preset), lens=lens, shutter=shutter)
-    camera = open_camera(camera)
     frames = checked_range(frames) if frames is not None else None
-    prior = open_depth(depth, depth_kind) if options.uses_depth else None
-    from_motion = isinstance(objects, str) and objects == FROM_MOTION
-    mask_prior, object_masks = open_masks(masks), None if from_motion else open_objects(objects)
-    known = read_control(control) if isinstance(control, str | Path) else control
-    recording = open_imu(imu) if isinstance(imu, str | Path) else imu
     if unordered is None:
         unordered = isinstance(source, str | Path) and looks_unordered(Path(source), frames)
-    _check_control(known, source, frames, unordered=unordered)
-    if unordered and recording is not None:
-        raise InputError("an IMU goes with a video; images in any order have no times")
-    if unordered and (object_masks is not None or from_motion):
-        raise InputError("objects are tracked in a video; images in any order show no motion")
-    if unordered and (fields != "auto" or pixel_aspect is not None):
-        raise InputError("fields and pixel aspect are of a shot; images in any order take their pixels as square")
-    if from_motion and isinstance(source, Iterator):
-        raise InputError("objects that move by themselves need frames that can be read twice; these are an iterator")
-    footage = partial(read_frames, source, frames, fields=fields, pixel_aspect=pixel_aspect)
-    if unordered:
-        result = _from_images(source, frames, camera, prior, mask_prior, options, known, features, work, progress)
-    else:
-        solve = partial(
-            _solve, source=source, camera=camera, depth=prior, masks=mask_prior, objects=object_masks,
-            again=footage if from_motion else None, options=options, control=known, imu=recording, progress=progress,
-        )  # fmt: skip
-        result = _from_shot(source, footage, solve)
-    said = {
-        "source": str(source) if isinstance(source, str | Path) else "frames",
-        "unordered": unordered,
-        "features": str(features),
-        "objects": FROM_MOTION if from_motion else _name_of(object_masks),
-        **input_options(source, prior, mask_prior, frames, fields, pixel_aspect),
-    }
+    options = replace(Options.preset_named(preset), lens=lens, shutter=shutter)
+    from_motion = isinstance(objects, str) and objects == FROM_MOTION
+    given = Inputs(
+        source=source,
+        frames=frames,
+        fields=fields,
+        pixel_aspect=pixel_aspect,
+        unordered=unordered,
+        camera=open_camera(camera),
+        depth=open_depth(depth, depth_kind) if options.uses_depth else None,
+        masks=open_masks(masks),
+        objects=None if from_motion else open_objects(objects),
+        from_motion=from_motion,
+        control=read_control(control) if isinstance(control, str | Path) else control,
+        imu=open_imu(imu) if isinstance(imu, str | Path) else imu,
+        features=features,
+        work=work,
+        options=options,
+    )
+    result = _from_images(given, progress) if unordered else _from_shot(given, progress)
+    said = given.described()
     for part in (result, *result.others):
         part.seconds["total"] = time.perf_counter() - begin
         part.options |= said
@@ -148,114 +134,56 @@ def _check_choice(name: str, value: str, expected: tuple[str, ...]) -> None:
         raise InputError(f"unknown {name} '{value}', expected one of {', '.join(expected)}")
 
 
-def _check_control(control: Control | None, source: object, frames: slice | None, *, unordered: bool) -> None:
-    """Before the long work: a folder has all frames that the control names."""
-    if control is not None and isinstance(source, str | Path) and Path(source).is_dir():
-        if unordered:
-            names = [(index, path.name) for index, path in enumerate(list_images(Path(source)))][frames or slice(None)]
-        else:
-            images = chosen(numbered_images(Path(source)), frames or checked_range(slice(None)))
-            names = [(number, path.name) for number, path in images]
-        find_frames(control, names)
-
-
-def input_options(
-    source: object,
-    depth: DepthPrior | None,
-    masks: MaskPrior | None,
-    frames: slice | None,
-    fields: Fields = "auto",
-    pixel_aspect: float | None = None,
-) -> dict[str, Any]:
-    """What is written beside the options of a result.
-
-    The number that a sequence begins with, the names of the priors, the range, and how footage was read.
-    """
-    return {
-        "first_number": numbers[0] if (numbers := sequence_of(source)) else None,
-        "depth": depth.name if depth is not None else None,
-        "depth_kind": str(depth.kind) if depth is not None else None,
-        "masks": _name_of(masks),
-        "frames": range_text(frames) if frames is not None else None,
-        "fields": fields,
-        "pixel_aspect": pixel_aspect,
-    }
-
-
-def _name_of(masks: MaskPrior | ObjectMasks | None) -> str | None:
-    return getattr(masks, "name", type(masks).__name__) if masks is not None else None
-
-
-def _from_shot(
-    source: str | Path | Iterable[Frame | NDArray[np.uint8]],
-    footage: Callable[[], Iterator[Frame]],
-    solve: Callable[[Iterator[Frame], Sequence[LeftOut]], Reconstruction],
-) -> Reconstruction:
+def _from_shot(given: Inputs, progress: Progress | None) -> Reconstruction:
     """The one shot of a source; of a file or folder without the slates and bars beside it.
 
-    Args:
-        footage: opens the source; a file or folder is read anew where it holds more than one view.
+    A file or folder is read anew where it holds more than one view.
 
     Raises:
         ReconstructionError: there are several shots, or as in `Stream.finish`.
     """
-    if not isinstance(source, str | Path):
-        return solve(footage(), ())
+    if not isinstance(given.source, str | Path):
+        return _solve(given, given.footage(), (), progress)
     try:
-        result = solve(until_another_view(footage()), ())
+        result = _solve(given, until_another_view(given.footage()), (), progress)
     except AnotherView:
-        edit = read_edit(footage())
+        edit = read_edit(given.footage())
         if len(edit.starts) > 1:
             raise ReconstructionError(edit.cuts) from None
-        result = solve(footage(), edit.left_out)
+        result = _solve(given, given.footage(), edit.left_out, progress)
         result.notes[:0] = [f"{part.said[0].upper()}{part.said[1:]}: left out." for part in edit.left_out]
-    if sequence_of(source) and (gaps := missing_numbers([frame.index for frame in result.frames])):
+    if sequence_of(given.source) and (gaps := missing_numbers([frame.index for frame in result.frames])):
         result.notes.append(f"The numbering of the frames has gaps: {gaps} are missing.")
     return result
 
 
 def _solve(
-    images: Iterator[Frame],
-    left_out: Sequence[LeftOut],
-    *,
-    source: object,
-    camera: pycolmap.Camera | None,
-    depth: DepthPrior | None,
-    masks: MaskPrior | None,
-    objects: ObjectMasks | None,
-    again: Callable[[], Iterator[Frame]] | None,
-    options: Options,
-    control: Control | None,
-    imu: ImuRecording | None,
-    progress: Progress | None,
+    given: Inputs, images: Iterator[Frame], left_out: Sequence[LeftOut], progress: Progress | None
 ) -> Reconstruction:
+    """One shot from the first frame to the last, and what moves in it by itself."""
+    options = given.options
     with ExitStack() as held:
-        seen, observed, shared = masks, None, depth
-        if objects is not None:
-            shared = remembered = RememberedDepth(depth) if depth is not None else None
-            seen = observed = held.enter_context(ObservedObjects(objects, masks, remembered, options.tracker))
-        stream = held.enter_context(Stream(camera, depth=shared, masks=seen, options=options, control=control, imu=imu))
-        beside: list[FrameResult] = []
-        for done, frame in enumerate(images):
-            if progress is not None:
-                progress("frames", done, None)
-            if reason := left_out_of(left_out, frame.index):
-                beside.append(FrameResult(frame.index, frame.name, frame.timestamp, FrameStatus.LEFT_OUT, reason))
-                continue
-            stream.push(frame)
-            if observed is not None:
-                with stream.seconds.of("objects"):
-                    observed.push(frame)
+        seen, observed, depth = given.masks, None, given.depth
+        if given.objects is not None:
+            depth = remembered = RememberedDepth(depth) if depth is not None else None
+            seen = observed = held.enter_context(
+                ObservedObjects(given.objects, given.masks, remembered, options.tracker)
+            )
+        stream = held.enter_context(
+            Stream(given.camera, depth=depth, masks=seen, options=options, control=given.control, imu=given.imu)
+        )
+        beside = _pushed(stream, observed, images, left_out, progress)
         if not stream.frames:
-            raise InputError(f"no frames in {source}")
-        check_matched(source, depth, masks, objects)
+            raise InputError(f"no frames in {given.source}")
+        given.check_matched()
         result = stream.finish(progress)
-        if (observed is not None or again is not None) and progress is not None:
+        if (observed is not None or given.from_motion) and progress is not None:
             progress("objects", 0, None)
         with stream.seconds.of("objects"), OneThreadEach():
-            if again is not None:
-                prior = depth if options.uses_depth else None
-                observed = held.enter_context(seen_again(result, stream.all_tracks(), again(), prior, options))
+            if given.from_motion:
+                observed = held.enter_context(
+                    seen_again(result, stream.all_tracks(), given.footage(), given.depth, options)
+                )
             if observed is not None:
                 add_objects(result, observed, options)
         if observed is not None:
@@ -265,24 +193,39 @@ def _solve(
         return result
 
 
-def _from_images(
-    source: str | Path | Iterable[Frame | NDArray[np.uint8]],
-    frames: slice | None,
-    camera: pycolmap.Camera | None,
-    depth: DepthPrior | None,
-    masks: MaskPrior | None,
-    options: Options,
-    control: Control | None,
-    features: str | Path,
-    work: str | Path | None,
+def _pushed(
+    stream: Stream,
+    observed: ObservedObjects | None,
+    images: Iterator[Frame],
+    left_out: Sequence[LeftOut],
     progress: Progress | None,
-) -> Reconstruction:
-    with work_folder(work) as folder:
-        images = ImageSet(folder, camera, depth=depth, masks=masks, features=features, options=options, control=control)
-        if isinstance(source, str | Path) and (others := other_files(Path(source))):
+) -> list[FrameResult]:
+    """Push the frames of the shot; gives those that are left out, which are beside it."""
+    beside = []
+    for done, frame in enumerate(images):
+        if progress is not None:
+            progress("frames", done, None)
+        if reason := left_out_of(left_out, frame.index):
+            beside.append(FrameResult(frame.index, frame.name, frame.timestamp, FrameStatus.LEFT_OUT, reason))
+            continue
+        stream.push(frame)
+        if observed is not None:
+            with stream.seconds.of("objects"):
+                observed.push(frame)
+    return beside
+
+
+def _from_images(given: Inputs, progress: Progress | None) -> Reconstruction:
+    """A set of photographs in any order."""
+    with work_folder(given.work) as folder:
+        images = ImageSet(
+            folder, given.camera, depth=given.depth, masks=given.masks, features=given.features, options=given.options,
+            control=given.control,
+        )  # fmt: skip
+        if isinstance(given.source, str | Path) and (others := other_files(Path(given.source))):
             some = ", ".join(others[:5]) + (", …" if len(others) > 5 else "")
             images.note(f"Not images, and ignored: {some}.")
-        for done, image in enumerate(read_images(source, frames)):
+        for done, image in enumerate(read_images(given.source, given.frames)):
             if progress is not None:
                 progress("images", done, None)
             if isinstance(image, Frame):
@@ -290,14 +233,5 @@ def _from_images(
             else:
                 images.leave_out(image.index, image.name, image.reason)
         result = images.finish(progress)
-        check_matched(source, depth, masks)
+        given.check_matched()
         return result
-
-
-def check_matched(
-    source: object, depth: DepthPrior | None, masks: MaskPrior | None, objects: ObjectMasks | None = None
-) -> None:
-    """After all frames: a folder of maps or masks of which none belongs to a frame is an InputError."""
-    for name, folder in (("depth map", depth), ("mask", masks), ("mask of an object", objects)):
-        if isinstance(folder, DepthFolder | MaskFolder | ObjectFolder) and folder.asked and not folder.matched:
-            raise InputError(f"no {name} in the given folder matches a frame of {source}")

@@ -15,7 +15,6 @@ from typing import Any
 
 import pycolmap
 
-from factorsfm.api import check_matched, input_options
 from factorsfm.camera.files import camera_to_json, open_camera
 from factorsfm.cli.command import (
     Command,
@@ -36,6 +35,7 @@ from factorsfm.frames.live_sources import Source, open_source
 from factorsfm.frames.raw import RawFormat
 from factorsfm.inertial.mounting import open_imu
 from factorsfm.inertial.recording import ImuRecording
+from factorsfm.inputs import check_matched, input_options
 from factorsfm.priors.depth import DepthPrior, open_depth
 from factorsfm.priors.masks import MaskPrior, open_masks
 from factorsfm.report.result_folder import check_directory

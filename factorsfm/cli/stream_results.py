@@ -25,7 +25,7 @@ class StreamResults:
 
     Args:
         begin: `time.perf_counter` at the start of the command.
-        inputs: further options of the results, see `api.input_options`.
+        inputs: further options of the results, see `inputs.input_options`.
     """
 
     def __init__(self, arguments: argparse.Namespace, source: Source, begin: float, inputs: Mapping[str, Any]) -> None:

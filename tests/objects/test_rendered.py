@@ -153,7 +153,7 @@ def test_errors_are_as_large_as_the_covariance_says() -> None:
 
 
 def test_what_moves_by_itself_needs_frames_that_come_twice() -> None:
-    with pytest.raises(InputError, match=r"can be read twice; these are an iterator$"):
+    with pytest.raises(InputError, match=r"can be read twice, not an iterator$"):
         factorsfm.reconstruct(iter(crossing().shot.images), depth=None, objects="auto")
 
 
