@@ -166,7 +166,7 @@ class FlowTracker(Closing):
             "replenished": self._replenished,
             "next_id": self._next_id,
             "avoided": self._avoided,
-            "previous": self._previous.full if self._previous is not None else None,
+            "previous": self._previous.reduced if self._previous is not None else None,
             "tracks": self._tracks.state(),
             "ended": self._ended.state(),
         }
