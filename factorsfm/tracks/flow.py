@@ -10,6 +10,10 @@ the present frame. At every frame
 3. tracks that are not found there are searched by flow from the previous frame, and re-aligned;
 4. the local motion of the found tracks updates the maps;
 5. tracks end that were not found, left the image or entered the mask, and new ones start where the image has room.
+
+Flow and corners are sought in an image of bounded size, and the birth patches aligned in the full image, of which only
+what lies around the tracks is looked at: the cost hardly grows with the size of the image, and the errors are the same
+in pixels. So thresholds are in pixels: what they bound is the noise of a sensor and the reach of a window.
 """
 
 from __future__ import annotations
