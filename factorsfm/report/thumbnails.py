@@ -38,7 +38,8 @@ class Thumbnails(Closing):
     def add(self, image: NDArray[np.uint8]) -> None:
         """Add the next frame, (h, w, 3) BGR or (h, w) grey."""
         if self._added % self._step == 0:
-            self._kept[self._added] = self._worker.submit(thumbnail, image.copy())
+            small = _halved(image) if _is_large(image) else image.copy()  # of a large image no copy waits
+            self._kept[self._added] = self._worker.submit(thumbnail, small)
         self._added += 1
         if len(self._kept) > self._most:
             self._step *= 2
@@ -73,15 +74,23 @@ class Thumbnails(Closing):
 
 def thumbnail(image: NDArray[np.uint8]) -> bytes:
     """A JPEG at most 384 pixels wide; large images are halved first, which is fast."""
-    while image.shape[1] >= 2 * _WIDTH:
-        height, width = max(1, image.shape[0] // 2), image.shape[1] // 2
-        even = image[: 2 * height, : 2 * width]
-        image = np.asarray(cv2.resize(even, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+    while _is_large(image):
+        image = _halved(image)
     if image.shape[1] > _WIDTH:
         size = _WIDTH, max(1, round(image.shape[0] * _WIDTH / image.shape[1]))
         image = np.asarray(cv2.resize(image, size), np.uint8)
     _, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
     return jpeg.tobytes()
+
+
+def _is_large(image: NDArray[np.uint8]) -> bool:
+    return bool(image.shape[1] >= 2 * _WIDTH)
+
+
+def _halved(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    height, width = max(1, image.shape[0] // 2), image.shape[1] // 2
+    even = image[: 2 * height, : 2 * width]
+    return np.asarray(cv2.resize(even, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def _done(jpeg: bytes) -> Future[bytes]:

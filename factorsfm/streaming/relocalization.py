@@ -9,10 +9,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.tracks.grey import at_scale, reduced_image
+
 Index = NDArray[np.int64]
 Descriptors = NDArray[np.uint8]
 
-_PATCH_PX = 31  # side of the patch that a descriptor describes
+_PATCH_PX = 31  # side of the patch that a descriptor describes, in an image of the size in which motion is sought
 _SCALES = (1.0, 0.7, 1.4)  # of the new image against a keyframe
 _RATIO = 0.8  # largest distance of the best match against the second best
 _LEAST_MATCHES = 12
@@ -36,7 +38,8 @@ class Relocalizer:
 
     def remember(self, grey: NDArray[np.uint8], ids: Index, xy: NDArray[np.float64]) -> None:
         """Keep a keyframe: (h, w) image, its track ids and their positions (n, 2) in pixels."""
-        kept, descriptors = _describe(grey, xy)
+        reduced, scale = reduced_image(grey)
+        kept, descriptors = _describe(reduced, at_scale(xy, scale))
         self.views.append(KeyframeView(ids[kept], descriptors))
 
     def find(self, grey: NDArray[np.uint8], xy: NDArray[np.float64]) -> tuple[Index, NDArray[np.intp]]:
@@ -49,8 +52,10 @@ class Relocalizer:
         best = np.zeros(0, np.int64), np.zeros(0, np.intp)
         if not self.views or not len(xy):
             return best
+        reduced, scale = reduced_image(grey)
+        xy = at_scale(xy, scale)
         described = [
-            _describe(cv2.resize(grey, None, fx=s, fy=s, interpolation=cv2.INTER_AREA), xy * s) for s in _SCALES
+            _describe(cv2.resize(reduced, None, fx=s, fy=s, interpolation=cv2.INTER_AREA), xy * s) for s in _SCALES
         ]
         for step in range(min(_VIEWS_PER_IMAGE, len(self.views))):
             view = self.views[(self.next_view + step) % len(self.views)]

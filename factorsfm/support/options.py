@@ -26,9 +26,10 @@ class TrackerOptions:
         max_tracks: most tracks alive at a time.
         replenish_below: share of `max_tracks` that must be free before new tracks start.
         window_px: side of the Lucas-Kanade window.
-        levels: pyramid levels above the full image in the flow from frame to frame.
+        levels: pyramid levels in the flow from frame to frame, above the image that it is sought in: the full one, or
+            where its longer side has more than 1280 pixels that one halved until it has no more.
         border_px: smallest distance of a track to the image border.
-        flow_check_px: largest forward-backward error of the flow from frame to frame.
+        flow_check_px: largest forward-backward error of the flow from frame to frame, in pixels of that image.
         realign_check_px: largest forward-backward error of the re-alignment with the birth patch.
         realign_reach_px: largest correction by the re-alignment.
         corner_quality: Shi-Tomasi score of the weakest corner, as a share of the strongest in the image.

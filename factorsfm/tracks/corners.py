@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.support.options import TrackerOptions
-from factorsfm.tracks.grey import GreyFrame
+from factorsfm.tracks.grey import GreyFrame, at_scale
 
 Array = NDArray[np.float32]
 
@@ -24,7 +24,7 @@ def new_corners(
 ) -> Array:
     """The strongest Shi-Tomasi corners away from what is occupied, from every cell of a grid in turn.
 
-    Corners are sought in the image of half the size, since it does not matter where exactly a patch lies.
+    Corners are sought in an image of half the size or less, since it does not matter where exactly a patch lies.
 
     Args:
         occupied: (n, 2) pixels of the tracks alive; a new one keeps its distance to them.
@@ -35,20 +35,23 @@ def new_corners(
     Returns:
         (k, 2) pixels, centres at integers.
     """
-    h, w = frame.half.shape
-    border = -(-options.border_px // 2)
+    image, scale = (frame.reduced, frame.scale) if frame.scale > 1 else (frame.half, 2)
+    h, w = image.shape
+    border = -(-options.border_px // scale)
     free = np.zeros((h, w), np.uint8)
     free[border : h - border, border : w - border] = 255
     if mask is not None:
-        free[mask[: 2 * h : 2, : 2 * w : 2] | mask[1 : 2 * h : 2, 1 : 2 * w : 2]] = 0
+        for k in range(scale):
+            free[mask[k : scale * h : scale, k : scale * w : scale]] = 0
     distance = max(2, round(0.4 * (w * h / options.max_tracks) ** 0.5))
-    for xy, radius in ((occupied, distance), (avoided, options.window_px // 2)):
-        for x, y in (0.5 * xy - 0.25).round().astype(int).tolist():
+    for xy, radius in ((occupied, distance), (avoided, options.window_px // scale)):
+        for x, y in at_scale(xy, scale).round().astype(int).tolist():
             cv2.circle(free, (x, y), radius, 0, -1)
-    corners = cv2.goodFeaturesToTrack(frame.half, 0, options.corner_quality, distance, mask=free, blockSize=3)
+    corners = cv2.goodFeaturesToTrack(image, 0, options.corner_quality, distance, mask=free, blockSize=3)
     if corners is None:
         return np.zeros((0, 2), np.float32)
-    return _spread(2.0 * np.rint(corners[:, 0]), count, frame.full.shape)
+    middle = (scale - 1) // 2  # the pixel of the full image there, or beside the middle of four
+    return _spread(scale * np.rint(corners[:, 0]) + np.float32(middle), count, frame.full.shape)
 
 
 def _spread(corners: Array, count: int, shape: tuple[int, ...]) -> Array:

@@ -10,6 +10,10 @@ the present frame. At every frame
 3. tracks that are not found there are searched by flow from the previous frame, and re-aligned;
 4. the local motion of the found tracks updates the maps;
 5. tracks end that were not found, left the image or entered the mask, and new ones start where the image has room.
+
+Flow and corners are sought in an image of bounded size, and the birth patches aligned in the full image, of which only
+what lies around the tracks is looked at: the cost hardly grows with the size of the image, and the errors are the same
+in pixels. So thresholds are in pixels: what they bound is the noise of a sensor and the reach of a window.
 """
 
 from __future__ import annotations
@@ -166,7 +170,7 @@ class FlowTracker(Closing):
             "replenished": self._replenished,
             "next_id": self._next_id,
             "avoided": self._avoided,
-            "previous": self._previous.full if self._previous is not None else None,
+            "previous": self._previous.reduced if self._previous is not None else None,
             "tracks": self._tracks.state(),
             "ended": self._ended.state(),
         }

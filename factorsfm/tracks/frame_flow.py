@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from factorsfm.support.options import TrackerOptions
 from factorsfm.support.semidefinite import solution
-from factorsfm.tracks.grey import GreyFrame
+from factorsfm.tracks.grey import GreyFrame, at_full_size, at_scale
 from factorsfm.tracks.parts import in_parts
 
 Array = NDArray[np.float32]
@@ -23,7 +23,7 @@ _LEAST_FIT_SCALE_PX = 0.5  # scale of the kernel of the fit, at least
 
 
 class FrameFlow:
-    """Pyramidal Lucas-Kanade flow from one frame to the next.
+    """Pyramidal Lucas-Kanade flow from one frame to the next, in the reduced images.
 
     Args:
         options: window, pyramid levels and the limit of the forward-backward check.
@@ -65,35 +65,38 @@ class FrameFlow:
             (n, 2) pixels in the frame, and whether each passes the forward-backward check.
         """
 
+        scale = frame.scale
+
         def part(rows: NDArray[np.intp]) -> tuple[Array, Flags]:
-            old = xy[rows]
-            coarse, _ = self._coarse_flow(previous, frame, old, None if start is None else start[rows])
+            coarse, _ = self._coarse_flow(previous, frame, xy[rows], None if start is None else start[rows])
+            old = at_scale(xy[rows], scale)
             forward, status, _ = cv2.calcOpticalFlowPyrLK(
-                previous.full, frame.full, old, coarse, winSize=self._window, maxLevel=0, criteria=_CRITERIA,
-                flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+                previous.reduced, frame.reduced, old, at_scale(coarse, scale), winSize=self._window, maxLevel=0,
+                criteria=_CRITERIA, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
             )  # fmt: skip
             # The way back starts where it should end: the check only asks whether it stays there.
             back, status_back, _ = cv2.calcOpticalFlowPyrLK(
-                frame.full, previous.full, forward, old.copy(), winSize=self._window, maxLevel=1, criteria=_CRITERIA,
-                flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+                frame.reduced, previous.reduced, forward, old.copy(), winSize=self._window, maxLevel=1,
+                criteria=_CRITERIA, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
             )  # fmt: skip
             passed = (status[:, 0] == 1) & (status_back[:, 0] == 1)
             passed &= np.linalg.norm(back - old, axis=1) < self._check_px
-            return forward, passed
+            return at_full_size(forward, scale), passed
 
-        return in_parts(part, len(xy), len(xy), self._pool) if len(xy) else (xy, np.zeros(0, bool))
+        return in_parts(part, len(xy), self._pool) if len(xy) else (xy, np.zeros(0, bool))
 
     def _coarse_flow(
         self, previous: GreyFrame, frame: GreyFrame, xy: Array, start: Array | None = None
     ) -> tuple[Array, Flags]:
-        """Flow of points in the images of half the size, in pixels of the full ones, and whether it was found."""
-        first = None if start is None else (start - 0.5) / 2
+        """Flow of points in the images of half the reduced size, in full pixels, and whether it was found."""
+        scale = 2 * frame.scale
+        first = None if start is None else at_scale(start, scale)
         found, status, _ = cv2.calcOpticalFlowPyrLK(
-            previous.half, frame.half, (xy - 0.5) / 2, first, winSize=self._window,
+            previous.half, frame.half, at_scale(xy, scale), first, winSize=self._window,
             maxLevel=self._levels - 1 if start is None else 1, criteria=_CRITERIA,
             flags=0 if start is None else cv2.OPTFLOW_USE_INITIAL_FLOW,
         )  # fmt: skip
-        return 2 * found + 0.5, status[:, 0] == 1
+        return at_full_size(found, scale), status[:, 0] == 1
 
 
 def robust_fit(design: NDArray[np.float64], target: Array) -> NDArray[np.float64]:

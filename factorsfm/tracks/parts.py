@@ -15,14 +15,13 @@ _WORTH_TWO_PARTS = 250  # rows; for fewer, preparing an image twice takes longer
 
 
 def in_parts(
-    function: Callable[[Rows], tuple[Array, NDArray[np.bool_]]], count: int, most: int, pool: ThreadPoolExecutor
+    function: Callable[[Rows], tuple[Array, NDArray[np.bool_]]], count: int, pool: ThreadPoolExecutor
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Apply a function to the rows 0 to count - 1 in parts, and concatenate its results.
 
     Args:
         function: from rows to one value and one flag for each.
-        most: largest number of rows in a part.
     """
-    parts = np.array_split(np.arange(count), max(2 if count > _WORTH_TWO_PARTS else 1, -(-count // most)))
+    parts = np.array_split(np.arange(count), 2 if count > _WORTH_TWO_PARTS else 1)
     values, flags = zip(*pool.map(function, parts), strict=True)
     return np.concatenate(values), np.concatenate(flags)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
@@ -11,7 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.tracks.parts import in_parts
-from factorsfm.tracks.tiles import cut_tiles, has_exposure_changed, match_tile_exposure, tile_atlas, warp_tiles
+from factorsfm.tracks.tiles import (
+    cut_tiles,
+    has_exposure_changed,
+    inner_tiles,
+    match_tile_exposure,
+    nearest_pixels,
+    tile_atlas,
+    warp_tiles,
+)
 
 Array = NDArray[np.float32]
 Image = NDArray[np.uint8]
@@ -142,46 +151,40 @@ class BirthPatches:
         Returns:
             (n, 2) pixels, and whether each is within reach and passes its check.
         """
+        if not len(rows):
+            return start, np.zeros(0, bool)
         self._wait()
         self._warp(rows)
         checked = np.ones(len(rows), bool) if checked is None else checked
 
-        tile = 2 * self._half + 1
-        columns = grey.shape[1] // tile
-        order = np.argsort(start[:, 1], kind="stable")
-        margin = self._half + int(np.ceil(reach_px)) + _MARGIN_PX
-
         def part(index: Rows) -> tuple[Array, NDArray[np.bool_]]:
-            """In a band of the frame: to prepare all of it for each part takes longer than to follow many points."""
-            mine = order[index]
-            height = max(-(-len(mine) // columns) * tile, int(np.ptp(start[mine, 1])) + 2 * margin)
-            top = int(np.clip(start[mine[0], 1] - margin, 0, max(0, grey.shape[0] - height)))
-            shift = np.array([0, top], np.float32)
-            band = grey[top : top + height]
-            found, good = self._align(band, rows[mine], start[mine] - shift, check_px, reach_px, checked[mine])
-            return found + shift, good
+            return self._align(grey, rows[index], start[index], check_px, reach_px, checked[index])
 
-        found, good = in_parts(part, len(rows), columns * (grey.shape[0] // tile), pool)
-        back = np.argsort(order)
-        return found[back], good[back]
+        return in_parts(part, len(rows), pool)
 
     def _align(
         self, grey: Image, rows: Rows, start: Array, check_px: float, reach_px: float, checked: NDArray[np.bool_]
     ) -> tuple[Array, NDArray[np.bool_]]:
-        tiles = self._warped[self._slots[rows]]
-        if has_exposure_changed(tiles, grey, start):  # matched only then, since it costs a little accuracy
-            tiles = match_tile_exposure(tiles, grey, start)
-        atlas, centers = tile_atlas(tiles, grey.shape)
+        """Only what lies around the tracks is looked at: to prepare all of a large frame costs more than the rest."""
+        pixel = nearest_pixels(start, grey.shape)
+        tiles, seen = self._warped[self._slots[rows]], cut_tiles(grey, start, self._half + math.ceil(reach_px) + 1)
+        seen_inner = inner_tiles(seen, self._half)
+        if has_exposure_changed(tiles, seen_inner):  # matched only then, since it costs a little accuracy
+            tiles = match_tile_exposure(tiles, seen_inner)
+        atlas, centers = tile_atlas(tiles, seen.shape[1])
+        frame, _ = tile_atlas(seen, seen.shape[1])
+        inside = np.abs(start - pixel).max(axis=1) <= 1.0
+        first = centers + np.where(inside[:, None], start - pixel, 0.0).astype(np.float32)
         aligned, status, _ = cv2.calcOpticalFlowPyrLK(
-            atlas, grey, centers, start.copy(), winSize=self._window, maxLevel=0, criteria=_FORWARD_CRITERIA,
+            atlas, frame, centers, first.copy(), winSize=self._window, maxLevel=0, criteria=_FORWARD_CRITERIA,
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         )  # fmt: skip
-        good = (status[:, 0] == 1) & (np.linalg.norm(aligned - start, axis=1) < reach_px)
+        good = inside & (status[:, 0] == 1) & (np.linalg.norm(aligned - first, axis=1) < reach_px)
 
         def passes(index: Rows) -> NDArray[np.bool_]:
             """The forward-backward check."""
             back, status, _ = cv2.calcOpticalFlowPyrLK(
-                grey, atlas, aligned[index], centers[index], winSize=self._window, maxLevel=0,
+                frame, atlas, aligned[index], centers[index], winSize=self._window, maxLevel=0,
                 criteria=_BACKWARD_CRITERIA, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
             )  # fmt: skip
             return np.asarray((status[:, 0] == 1) & (np.linalg.norm(back - centers[index], axis=1) < check_px))
@@ -191,7 +194,7 @@ class BirthPatches:
             good[some] = passes(some)
         if len(rest) and (not len(some) or good[some].mean() < _LEAST_PASSED):
             good[rest] = passes(rest)
-        return aligned, good
+        return np.asarray(aligned - first + start, np.float32), good
 
     def _warp(self, rows: Rows) -> None:
         """Warp the patches again whose map has changed."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -17,32 +19,42 @@ _REMAP_ROWS = 30_000  # per call: OpenCV's remap takes images of fewer than 32,7
 
 def cut_tiles(grey: Image, xy: Array, half: int) -> Image:
     """Tiles (n, 2 half + 1, 2 half + 1) around points (n, 2), at the nearest pixel; borders are reflected."""
-    side = 2 * half + 1
-    padded = cv2.copyMakeBorder(grey, half, half, half, half, cv2.BORDER_REFLECT_101)  # as in OpenCV's flow
-    x, y = np.clip(np.rint(xy), 0, np.array(grey.shape[::-1]) - 1).astype(int).T
-    return np.asarray(np.lib.stride_tricks.sliding_window_view(padded, (side, side))[y, x], np.uint8)
+    side, last = 2 * half + 1, np.array(grey.shape[::-1]) - 1
+    pixel = nearest_pixels(xy, grey.shape)
+    corner = np.clip(pixel - half, 0, np.maximum(last + 1 - side, 0))
+    if side <= min(grey.shape):
+        tiles = np.lib.stride_tricks.sliding_window_view(grey, (side, side))[corner[:, 1], corner[:, 0]]
+        beyond = np.nonzero((corner != pixel - half).any(axis=1))[0]
+    else:
+        tiles, beyond = np.empty((len(xy), side, side), np.uint8), np.arange(len(xy))
+    around = np.abs(pixel[beyond, :, None] + np.arange(-half, half + 1))  # (k, 2, side)
+    x, y = np.moveaxis(last[:, None] - np.abs(last[:, None] - around), 1, 0)  # reflected as in OpenCV's flow
+    tiles[beyond] = grey[y[:, :, None], x[:, None, :]]
+    return tiles
 
 
-def has_exposure_changed(tiles: Image, grey: Image, xy: Array) -> bool:
-    """Whether an image at points (n, 2) is lighter or darker than tiles (n, side, side), by a sample of them."""
-    half = tiles.shape[1] // 2
-    x, y = np.rint(xy).astype(int).T
-    h, w = grey.shape
-    inside = np.nonzero((x >= half) & (y >= half) & (x < w - half) & (y < h - half))[0]
-    if not len(inside):
-        return False
-    sampled = inside[:: -(-len(inside) // _SAMPLED_TILES)]
-    windows = np.lib.stride_tricks.sliding_window_view(grey, tiles.shape[1:])[y[sampled] - half, x[sampled] - half]
-    in_image, in_tile = (
-        cv2.reduce(a.reshape(len(sampled), -1), 1, cv2.REDUCE_AVG, dtype=cv2.CV_32F) for a in (windows, tiles[sampled])
-    )
-    return bool(abs(np.median(in_image - in_tile)) >= _EXPOSURE_CHANGE)
+def nearest_pixels(xy: Array, shape: tuple[int, ...]) -> NDArray[np.int64]:
+    """(n, 2) the pixel of an image that is nearest to each of n points."""
+    return np.clip(np.rint(xy), 0, np.array(shape[1::-1]) - 1).astype(np.int64)
 
 
-def match_tile_exposure(tiles: Image, grey: Image, xy: Array) -> Image:
-    """Tiles (n, side, side) with the mean and the contrast of an image at points (n, 2)."""
-    n, side, _ = tiles.shape
-    tile, seen = (a.reshape(n, -1).astype(np.float32) for a in (tiles, cut_tiles(grey, xy, side // 2)))
+def inner_tiles(tiles: Image, half: int) -> Image:
+    """The middle of tiles, (n, 2 half + 1, 2 half + 1)."""
+    middle = tiles.shape[1] // 2
+    return tiles[:, middle - half : middle + half + 1, middle - half : middle + half + 1]
+
+
+def has_exposure_changed(tiles: Image, seen: Image) -> bool:
+    """Whether what is seen now, (n, side, side), is lighter or darker than tiles of that shape, by a sample of them."""
+    sampled = slice(None, None, -(-len(tiles) // _SAMPLED_TILES))
+    now, then = (a[sampled].mean(axis=(1, 2), dtype=np.float32) for a in (seen, tiles))
+    return bool(abs(np.median(now - then)) >= _EXPOSURE_CHANGE)
+
+
+def match_tile_exposure(tiles: Image, seen_tiles: Image) -> Image:
+    """Tiles (n, side, side) with the mean and the contrast of what is seen now, tile by tile."""
+    n = len(tiles)
+    tile, seen = (a.reshape(n, -1).astype(np.float32) for a in (tiles, seen_tiles))
     mean, seen_mean = (a.mean(axis=1, keepdims=True) for a in (tile, seen))
     tile -= mean
     seen -= seen_mean
@@ -76,15 +88,16 @@ def warp_tiles(tiles: Image, affine: Array, half: int) -> Image:
     return out
 
 
-def tile_atlas(tiles: Image, shape: tuple[int, ...]) -> tuple[Image, Array]:
-    """Tiles (n, side, side) side by side in one image (h, w), and the pixels of their centres, (n, 2)."""
+def tile_atlas(tiles: Image, cell: int) -> tuple[Image, Array]:
+    """Tiles (n, side, side) in the middle of square cells of one image, and the pixels of their centres, (n, 2)."""
     n, side, _ = tiles.shape
-    columns = shape[1] // side
-    atlas = np.zeros(shape, np.uint8)
-    place = atlas[: shape[0] // side * side, : columns * side].reshape(-1, side, columns, side)
+    columns = math.isqrt(n - 1) + 1
+    margin = (cell - side) // 2
+    atlas = np.zeros((-(-n // columns), cell, columns, cell), np.uint8)
+    place = atlas[:, margin : margin + side, :, margin : margin + side]
     full, rest = divmod(n, columns)
     place[:full] = tiles[: full * columns].reshape(full, columns, side, side).transpose(0, 2, 1, 3)
     if rest:
         place[full, :, :rest] = tiles[full * columns :].transpose(1, 0, 2)
     r, c = np.divmod(np.arange(n), columns)
-    return atlas, np.stack([c * side + side // 2, r * side + side // 2], -1).astype(np.float32)
+    return atlas.reshape(-1, columns * cell), (np.stack([c, r], -1) * cell + cell // 2).astype(np.float32)
