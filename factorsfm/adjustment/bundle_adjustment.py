@@ -8,14 +8,13 @@ Points are unit bearings with an inverse distance, in which small motion is almo
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.adjustment.columns import Columns
 from factorsfm.adjustment.depth_term import AffinePrior, DepthTerm
 from factorsfm.adjustment.elimination import Block, Elimination, Normal, Term, reduced
+from factorsfm.adjustment.left_out import LeftOut
 from factorsfm.adjustment.marginals import Marginals, tangent_basis
 from factorsfm.adjustment.noise import block_inflation
 from factorsfm.adjustment.observations import Observations, PriorObservations
@@ -32,6 +31,7 @@ Index = NDArray[np.int64]
 
 _FIRST_DAMPING = 1e-4
 _LARGEST_DAMPING = 1e6
+_UNSEEN = 1e-13  # of the largest information: what is left where all is taken away
 
 
 class BundleAdjustment:
@@ -158,27 +158,24 @@ class BundleAdjustment:
             term.add(s, normal.camera, normal.camera_gradient)
         return normal
 
-    def of(self, rows: NDArray[np.bool_]) -> BundleAdjustment:
-        """The tracks alone, with some of their observations, where two of a point are left."""
-        o = self.observations
-        rows = rows & (np.bincount(o.point, rows)[o.point] >= 2)
-        points, point = np.unique(o.point[rows], return_inverse=True)
-        part = BundleAdjustment(
-            self.state.of(points), o.at(rows, point=point), self.options, ErrorModel(self.sigma),
-            free=self.free, known=replace(self.known, control=None),
-        )  # fmt: skip
-        part._anchor, part._point_sigma = self._anchor[points], self._point_sigma
-        return part
-
     # --- solving ------------------------------------------------------------------------------------------------
 
     def lens_step(self) -> Array:
         """By how much a Newton step moves what is free of log focal lengths and shape; 0 of what nothing is seen."""
-        information, gradient = self.condensed()
-        seen = information.diagonal() > 1e-200
-        step = np.zeros(len(gradient))
-        step[seen] = -solution(information[np.ix_(seen, seen)], gradient[seen])
-        return np.asarray(step[np.searchsorted(self._free, self.columns.optics.start + self.free_optics)])
+        normal = self._linearize()
+        return self._lens_step(*reduced(normal, self._elimination.cross_blocks(normal), 0.0)[:2])
+
+    def lens_steps_without(self, part: Index) -> Array:
+        """(parts, c) as `lens_step`, of the tracks without each part of their observations; `part`: (m,) of each."""
+        normal = self._linearize()
+        rest = LeftOut(normal, self._elimination.cross_blocks(normal))
+        return np.array([self._lens_step(*rest.without(part == left_out)) for left_out in np.unique(part)])
+
+    def _lens_step(self, information: Array, gradient: Array) -> Array:
+        free = self._free[information.diagonal()[self._free] > _UNSEEN * information.diagonal().max()]
+        step = np.zeros(self.columns.size)
+        step[free] = -solution(conditioned(information[np.ix_(free, free)]), gradient[free])
+        return step[self.columns.optics][self.free_optics]
 
     def condensed(self) -> tuple[Array, Array]:
         """Information matrix and gradient of the free camera side at the present state, the points eliminated."""
