@@ -28,6 +28,7 @@ from factorsfm.priors.depth import DepthFolder, DepthModel, DepthPrior
 from factorsfm.priors.depth_map import DepthKind, DepthMap
 from factorsfm.priors.masks import MaskFolder, MaskModel, MaskPrior
 from factorsfm.priors.object_masks import ObjectFolder, ObjectMasks
+from factorsfm.result.moving import Moving, MovingStretch
 from factorsfm.result.reading import read_result
 from factorsfm.result.reconstruction import FrameResult, PriorFit, Reconstruction
 from factorsfm.streaming.episode import Episode, ShotResult
@@ -73,6 +74,8 @@ __all__ = [
     "MaskModel",
     "MaskPrior",
     "ModelError",
+    "Moving",
+    "MovingStretch",
     "ObjectFolder",
     "ObjectFrame",
     "ObjectMasks",

@@ -32,9 +32,9 @@ from factorsfm.objects.observed import ObservedObjects, RememberedDepth
 from factorsfm.priors.depth import DepthFolder, DepthPrior, open_depth
 from factorsfm.priors.depth_map import DepthKind
 from factorsfm.priors.masks import MaskFolder, MaskPrior, open_masks
-from factorsfm.priors.object_masks import ObjectFolder, ObjectMasks, open_objects
+from factorsfm.priors.object_masks import FROM_MOTION, ObjectFolder, ObjectMasks, open_objects
 from factorsfm.result.left_out import add_left_out
-from factorsfm.result.objects import add_objects
+from factorsfm.result.objects import add_objects, seen_again
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.streaming.stream import Stream
 from factorsfm.support.errors import InputError, ReconstructionError
@@ -76,8 +76,9 @@ def reconstruct(
         depth: a network (ONNX file), a named model, a folder of maps, any `DepthPrior`, or None.
         depth_kind: what the prior holds, where it cannot be known.
         masks: a folder, "people" or "movable", another segmentation network, any `MaskPrior`, or None.
-        objects: masks of rigid things in a video that move by themselves and are solved, too: a folder (`ObjectFolder`)
-            or any `ObjectMasks`; the scene ignores them. They are `Reconstruction.objects` of the result.
+        objects: rigid things in a video that move by themselves and are solved, too: their masks, as a folder
+            (`ObjectFolder`) or any `ObjectMasks`, which the scene ignores; or "auto", what moves beside the scene,
+            from frames that can be read twice. They are `Reconstruction.objects` of the result.
         frames: range of the source's frames.
         fields, pixel_aspect: of a shot, see `read_frames`.
         preset: see `options.PRESETS`.
@@ -105,7 +106,8 @@ def reconstruct(
     camera = open_camera(camera)
     frames = checked_range(frames) if frames is not None else None
     prior = open_depth(depth, depth_kind) if options.uses_depth else None
-    mask_prior, object_masks = open_masks(masks), open_objects(objects)
+    from_motion = isinstance(objects, str) and objects == FROM_MOTION
+    mask_prior, object_masks = open_masks(masks), None if from_motion else open_objects(objects)
     known = read_control(control) if isinstance(control, str | Path) else control
     recording = open_imu(imu) if isinstance(imu, str | Path) else imu
     if unordered is None:
@@ -113,24 +115,26 @@ def reconstruct(
     _check_control(known, source, frames, unordered=unordered)
     if unordered and recording is not None:
         raise InputError("an IMU goes with a video; images in any order have no times")
-    if unordered and object_masks is not None:
+    if unordered and (object_masks is not None or from_motion):
         raise InputError("objects are tracked in a video; images in any order show no motion")
     if unordered and (fields != "auto" or pixel_aspect is not None):
         raise InputError("fields and pixel aspect are of a shot; images in any order take their pixels as square")
+    if from_motion and isinstance(source, Iterator):
+        raise InputError("objects that move by themselves need frames that can be read twice; these are an iterator")
     footage = partial(read_frames, source, frames, fields=fields, pixel_aspect=pixel_aspect)
     if unordered:
         result = _from_images(source, frames, camera, prior, mask_prior, options, known, features, work, progress)
     else:
         solve = partial(
-            _solve, source=source, camera=camera, depth=prior, masks=mask_prior, objects=object_masks, options=options,
-            control=known, imu=recording, progress=progress,
+            _solve, source=source, camera=camera, depth=prior, masks=mask_prior, objects=object_masks,
+            again=footage if from_motion else None, options=options, control=known, imu=recording, progress=progress,
         )  # fmt: skip
         result = _from_shot(source, footage, solve)
     said = {
         "source": str(source) if isinstance(source, str | Path) else "frames",
         "unordered": unordered,
         "features": str(features),
-        "objects": getattr(object_masks, "name", type(object_masks).__name__) if object_masks is not None else None,
+        "objects": FROM_MOTION if from_motion else _name_of(object_masks),
         **input_options(source, prior, mask_prior, frames, fields, pixel_aspect),
     }
     for part in (result, *result.others):
@@ -171,11 +175,15 @@ def input_options(
         "first_number": numbers[0] if (numbers := sequence_of(source)) else None,
         "depth": depth.name if depth is not None else None,
         "depth_kind": str(depth.kind) if depth is not None else None,
-        "masks": getattr(masks, "name", type(masks).__name__) if masks is not None else None,
+        "masks": _name_of(masks),
         "frames": range_text(frames) if frames is not None else None,
         "fields": fields,
         "pixel_aspect": pixel_aspect,
     }
+
+
+def _name_of(masks: MaskPrior | ObjectMasks | None) -> str | None:
+    return getattr(masks, "name", type(masks).__name__) if masks is not None else None
 
 
 def _from_shot(
@@ -215,6 +223,7 @@ def _solve(
     depth: DepthPrior | None,
     masks: MaskPrior | None,
     objects: ObjectMasks | None,
+    again: Callable[[], Iterator[Frame]] | None,
     options: Options,
     control: Control | None,
     imu: ImuRecording | None,
@@ -241,11 +250,15 @@ def _solve(
             raise InputError(f"no frames in {source}")
         check_matched(source, depth, masks, objects)
         result = stream.finish(progress)
-        if observed is not None:
-            if progress is not None:
-                progress("objects", 0, None)
-            with stream.seconds.of("objects"), OneThreadEach():
+        if (observed is not None or again is not None) and progress is not None:
+            progress("objects", 0, None)
+        with stream.seconds.of("objects"), OneThreadEach():
+            if again is not None:
+                prior = depth if options.uses_depth else None
+                observed = held.enter_context(seen_again(result, stream.all_tracks(), again(), prior, options))
+            if observed is not None:
                 add_objects(result, observed, options)
+        if observed is not None:
             result.seconds["objects"] = stream.seconds["objects"]
         if beside:
             add_left_out(result, beside)

@@ -18,6 +18,31 @@ LIMITED, FULL = 1, 2
 PQ, HLG = 16, 18
 
 
+QUIET_H265 = {"x265-params": "log-level=none"}
+DNXHR = {"profile": "dnxhr_hq"}
+
+# suffix, codec, pixels, options: what cameras, phones, editors and the web hand out.
+FORMATS = [
+    (".mp4", "libx264", "yuv420p", {}),
+    (".mp4", "libx265", "yuv420p10le", QUIET_H265),
+    (".mov", "prores_ks", "yuv422p10le", {}),
+    (".mov", "prores_ks", "yuva444p10le", {"profile": "4444"}),
+    (".mov", "dnxhd", "yuv422p", DNXHR),
+    (".mxf", "dnxhd", "yuv422p", DNXHR),
+    (".mxf", "mpeg2video", "yuv422p", {}),
+    (".mkv", "libx264", "yuv420p10le", {}),
+    (".webm", "libvpx-vp9", "yuv420p", {}),
+    (".mpg", "mpeg2video", "yuv420p", {}),
+    (".m2ts", "libx264", "yuv420p", {}),
+    (".ts", "mpeg2video", "yuv420p", {}),
+    (".avi", "mjpeg", "yuvj420p", {}),
+    (".avi", "mpeg4", "yuv420p", {}),
+    (".wmv", "wmv2", "yuv420p", {}),
+    (".mkv", "ffv1", "bgr0", {}),
+    (".gif", "gif", "gray", {}),
+]
+
+
 def moving_texture(count: int, step: float = 2.0, size: tuple[int, int] = (320, 240)) -> list[Image]:
     """Smooth grey texture that moves to the left by `step` pixels a frame; `size`: width and height."""
     width, height = size

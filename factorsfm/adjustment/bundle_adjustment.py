@@ -20,18 +20,17 @@ from factorsfm.adjustment.noise import block_inflation
 from factorsfm.adjustment.observations import Observations, PriorObservations
 from factorsfm.adjustment.problem import NOTHING, POSES, CameraTerm, ErrorModel, Free, Known
 from factorsfm.adjustment.residuals import cauchy
-from factorsfm.adjustment.semidefinite import conditioned, covariance_of, solution
 from factorsfm.adjustment.state import State
 from factorsfm.adjustment.track_term import TrackTerm
 from factorsfm.support.options import PolishOptions
 from factorsfm.support.rotations import exponential
+from factorsfm.support.semidefinite import conditioned, covariance_of, solution
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 _FIRST_DAMPING = 1e-4
 _LARGEST_DAMPING = 1e6
-_UNSEEN = 1e-13  # of the largest information: what is left where all is taken away
 
 
 class BundleAdjustment:
@@ -172,7 +171,7 @@ class BundleAdjustment:
         return np.array([self._lens_step(*rest.without(part == left_out)) for left_out in np.unique(part)])
 
     def _lens_step(self, information: Array, gradient: Array) -> Array:
-        free = self._free[information.diagonal()[self._free] > _UNSEEN * information.diagonal().max()]
+        free = self._free[information.diagonal()[self._free] > 1e-100]
         step = np.zeros(self.columns.size)
         step[free] = -solution(conditioned(information[np.ix_(free, free)]), gradient[free])
         return step[self.columns.optics][self.free_optics]

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.adjustment.track_errors import STRETCH, TrackErrors
+from factorsfm.support.semidefinite import covariance_and_root
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -177,8 +178,7 @@ def reduced(normal: Normal, blocks: list[Block], damping: float) -> tuple[Array,
     point = normal.point.copy()
     diagonal = np.einsum("nii->ni", point)
     diagonal += damping * diagonal + 1e-12
-    point_covariance = np.asarray(np.linalg.inv(point), np.float64)
-    root = np.asarray(np.linalg.cholesky(point_covariance), np.float64)
+    point_covariance, root = covariance_and_root(point)
     information = normal.camera.copy()
     information[np.diag_indices_from(information)] *= 1.0 + damping
     gradient = normal.camera_gradient.copy()

@@ -14,6 +14,8 @@ from factorsfm.adjustment.elimination import Block, Elimination, Normal, Term, r
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
+_ROUNDING = 1e-12  # of the information of a variable, left where all of it is taken away
+
 
 class LeftOut:
     """Information and gradient of the camera side without some observations, the points eliminated.
@@ -33,7 +35,8 @@ class LeftOut:
             self._cross[columns, span] = cross.reshape(len(columns), -1, 3)
 
     def without(self, rows: NDArray[np.bool_]) -> tuple[Array, Array]:
-        """(c, c) and (c,) without these observations, nor the last one of a point of which one is left."""
+        """Without these observations, nor the last one of a point of which one is left: (c, c), 0 for what nothing
+        sees any more, and (c,)."""
         rows = rows | ~self._enough(~rows)
         touched, term = self._part(rows)
         size, gone = len(self._normal.camera), ~np.isin(touched, self._term.point[~rows])
@@ -51,10 +54,11 @@ class LeftOut:
             cross[columns, span] -= block.reshape(len(columns), -1, 3)
         point[gone], pull[gone], cross[:, gone] = np.eye(3), 0.0, 0.0
         left = self._eliminated(Normal(nothing, zero, point, pull, []), cross)
-        return (
-            self._information - part.camera + left[0] - known[0],
-            self._gradient - part.camera_gradient + left[1] - known[1],
-        )
+        information = self._information - part.camera + left[0] - known[0]
+        camera = self._normal.camera.diagonal()
+        unseen = camera - part.camera.diagonal() <= _ROUNDING * camera
+        information[unseen] = information[:, unseen] = 0.0
+        return information, self._gradient - part.camera_gradient + left[1] - known[1]
 
     def _enough(self, rows: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """(m,) which of these observations are of points of which they are two or more."""

@@ -10,9 +10,12 @@ from numpy.typing import NDArray
 from factorsfm.adjustment.columns import Columns
 from factorsfm.adjustment.state import State
 from factorsfm.support.rotations import cross_matrices
+from factorsfm.support.semidefinite import solution
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+
+_ROUNDING = 1e-12  # of numbers that cancel
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,8 +46,13 @@ class Marginals:
             pull[:, columns] -= (cross @ weighted[span].reshape(-1, measured.shape[2])).T
         moved = pull @ self.camera
         spread = moved @ pull.T + np.einsum("nig,nih->gh", measured, weighted)
-        mixed = motion @ moved
-        return np.asarray(self.camera - mixed - mixed.T + motion @ spread @ motion.T)
+        mixed, carried = motion @ moved, motion @ spread @ motion.T
+        relative = self.camera - mixed - mixed.T + carried
+        # Where movements of the coordinates are hardly determined, large numbers cancel: what rounding leaves is as
+        # uncertain as it is wrong.
+        cancelled = self.camera.diagonal() + 2.0 * np.abs(mixed.diagonal()) + carried.diagonal()
+        relative[np.diag_indices_from(relative)] += _ROUNDING * cancelled
+        return np.asarray(relative)
 
     def inverse_distances(self, points: Index) -> Array:
         """(p, p) joint covariance of the inverse distances of some points."""
@@ -68,7 +76,7 @@ class Marginals:
         for cross, columns, span in self.blocks:
             gain = np.einsum("cni,ni->nc", cross.reshape(len(columns), -1, 3), self.point[span, 2])
             variance[span] += np.einsum("nc,nc->n", gain @ camera[np.ix_(columns, columns)], gain)
-        return np.sqrt(variance)
+        return np.sqrt(np.maximum(variance, 0.0))
 
 
 def in_scene_unit(marginals: Marginals, state: State, control: Array | None = None) -> Array:
@@ -139,7 +147,8 @@ def in_scene(marginals: Marginals, state: State, weights: Array) -> Array:
     )
     weighted = weights[:, None, None] ** 2 * moved
     normal = np.einsum("nig,nih->gh", weighted, moved)
-    measured = np.einsum("nij,nig->njg", by_point, weighted) @ np.linalg.inv(normal)
+    by_normal = solution(normal, np.eye(7))  # of few points, some movements of the coordinates are none of them
+    measured = np.einsum("nij,nig->njg", by_point, weighted) @ by_normal
     centers = -np.einsum("kji,kj->ki", state.rotation, state.translation)
     poses = Columns.of(state).poses
     motion = np.zeros((len(marginals.camera), 7))

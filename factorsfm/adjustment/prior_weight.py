@@ -19,6 +19,8 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.support.semidefinite import covariance_of, root_of, triangular_solution
+
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
@@ -82,8 +84,8 @@ def measure_weight(angles: Array, inverse_depth: Array, prior: Array, covariance
         for smooth, local in product(_SMOOTH, _LOCAL):
             total = covariance + nuisance + smooth**2 * kernel
             total[np.diag_indices_from(total)] += local**2
-            root = np.linalg.cholesky(total)
-            white = np.linalg.solve(root, difference)
+            root = root_of(total)
+            white = triangular_solution(root, difference)
             score = -0.5 * float(white @ white) - float(np.log(root.diagonal()).sum())
             usual = np.log([smooth / _USUAL_SMOOTH, local / _USUAL_LOCAL]) / np.log(_USUAL_FACTOR)
             score -= 0.5 * float(usual @ usual)
@@ -118,4 +120,4 @@ def field_grid(angles: Array, weight: PriorWeight) -> tuple[Index, Array, Array,
     among = covariance[nodes[:, :, None], nodes[:, None, :]]
     between = weight.smooth**2 - 2.0 * (weights * to_node).sum(1) + np.einsum("ni,nij,nj->n", weights, among, weights)
     rest = np.sqrt(weight.local**2 + np.maximum(between, 0.0))
-    return nodes, weights, np.linalg.inv(covariance), rest
+    return nodes, weights, covariance_of(covariance), rest

@@ -5,16 +5,19 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.state import State
 
+Index = NDArray[np.int64]
+
 _FRAMES = 24
 
 
-def some_frames(state: State, observations: Observations) -> tuple[State, Observations]:
-    """Few frames, evenly spread, that of the world among them, and the points that two of them see."""
+def some_frames(state: State, observations: Observations) -> tuple[Index, State, Observations]:
+    """Few frames, evenly spread, that of the world among them: their rows, and the points that two of them see."""
     count = len(state.rotation)
     frames = np.unique([*np.linspace(0, count - 1, min(count, _FRAMES)).astype(int), state.world])
     keep = np.isin(observations.frame, frames)
@@ -29,10 +32,11 @@ def some_frames(state: State, observations: Observations) -> tuple[State, Observ
         world=int(np.searchsorted(frames, state.world)),
     )
     frame, point = observations.frame[keep], observations.point[keep]
-    return part, observations.at(keep, frame=np.searchsorted(frames, frame), point=np.searchsorted(points, point))
+    frame, point = np.searchsorted(frames, frame), np.searchsorted(points, point)
+    return frames, part, observations.at(keep, frame=frame, point=point)
 
 
 def on_some_frames(adjustment: BundleAdjustment) -> BundleAdjustment:
     """Cameras and points of a solution on few frames, with the same noise."""
-    part = some_frames(adjustment.state, adjustment.observations)
-    return BundleAdjustment(*part, adjustment.options, adjustment.errors)
+    _, state, few = some_frames(adjustment.state, adjustment.observations)
+    return BundleAdjustment(state, few, adjustment.options, adjustment.errors)

@@ -18,7 +18,7 @@ from factorsfm.frames.fields import Fields
 from factorsfm.frames.folders import list_files
 from factorsfm.frames.video import VIDEO_SUFFIXES
 from factorsfm.priors.masks import MaskFolder
-from factorsfm.priors.object_masks import ObjectFolder
+from factorsfm.priors.object_masks import FROM_MOTION, ObjectFolder
 from factorsfm.support.errors import InputError
 from factorsfm.support.json_text import json_text
 from factorsfm.support.options import LensFreedom, ShutterUse
@@ -45,7 +45,7 @@ class Method:
             depth = str(Path(depth) / name)
         if masks is not None and Path(masks).is_dir():
             masks = str(Path(masks) / name) if (Path(masks) / name).is_dir() else None
-        if objects is not None:
+        if objects is not None and objects != FROM_MOTION:
             objects = str(Path(objects) / name) if (Path(objects) / name).is_dir() else None
         return replace(self, depth=depth, masks=masks, objects=objects)
 
@@ -134,9 +134,13 @@ def find_videos(source: Path, fields: Fields = "auto") -> list[Video]:
     stems = Counter(path.stem.lower() for path in paths)
     videos = []
     for path in paths:
-        status = path.stat()
         name = path.stem if stems[path.stem.lower()] == 1 else path.name
-        videos.append(Video(path.resolve(), name, status.st_size, status.st_mtime_ns, fields))
+        try:
+            status = path.stat()
+        except OSError:  # a link that leads nowhere; whoever reads it says so, and the other videos go on
+            videos.append(Video(path.absolute(), name, 0, 0, fields))
+        else:
+            videos.append(Video(path.resolve(), name, status.st_size, status.st_mtime_ns, fields))
     return videos
 
 
@@ -166,12 +170,13 @@ def plan_jobs(shots: Mapping[Video, Sequence[range]], method: Method, output: Pa
     for video, ranges in shots.items():
         own = method.of_video(video.name) if several else method
         masks = MaskFolder(own.masks) if own.masks is not None and Path(own.masks).is_dir() else None
+        things = ObjectFolder(own.objects) if own.objects not in (None, FROM_MOTION) else None
         for number, frames in enumerate(ranges, 1):
             # A shot without any mask is reconstructed without: often only shots with actors have masks.
             masked = masks is None or any(map(masks.has, frames))
             matched |= own.masks is not None and masked
             chosen = own if masked else replace(own, masks=None)
-            if own.objects is not None and not any(map(ObjectFolder(own.objects).has, frames)):
+            if things is not None and not any(map(things.has, frames)):
                 chosen = replace(chosen, objects=None)
             jobs.append(Job(video, frames, chosen, output.absolute() / video.name / f"shot_{number:03d}"))
     if method.masks is not None and not matched:

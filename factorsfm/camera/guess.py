@@ -9,6 +9,7 @@ from pathlib import Path
 import pycolmap
 
 from factorsfm.support.options import GIVEN_FOCAL_STD, GUESSED_FOCAL_STD
+from factorsfm.support.picture_area import PictureArea
 
 logger = logging.getLogger(__name__)
 
@@ -19,8 +20,14 @@ _FIELD_OF_VIEW_DEG = 50.0
 _EXIF_RATIOS = (0.2, 30.0)  # focal length over the longer image side; a value outside is an error in the file
 
 
-def guess_camera(width: int, height: int, image_path: Path | None = None, pixel_aspect: float = 1.0) -> pycolmap.Camera:
-    """First guess of an unknown lens: SIMPLE_PINHOLE, principal point in the middle of the image.
+def guess_camera(
+    width: int,
+    height: int,
+    image_path: Path | None = None,
+    pixel_aspect: float = 1.0,
+    picture: PictureArea | None = None,
+) -> pycolmap.Camera:
+    """First guess of an unknown lens: SIMPLE_PINHOLE, principal point in the middle of the picture.
 
     PINHOLE where pixels are not square, with focal lengths whose ratio is their aspect.
 
@@ -29,12 +36,14 @@ def guess_camera(width: int, height: int, image_path: Path | None = None, pixel_
         image_path: an image whose EXIF data may hold the focal length: as 35 mm equivalent, or with the resolution of
             the focal plane, or with a camera whose sensor COLMAP knows.
         pixel_aspect: width of a pixel over its height.
+        picture: what of the images is picture, where they have black bars; None if all is.
 
     Returns:
         A camera whose `has_prior_focal_length` is True if the focal length is from EXIF data. Otherwise the longer side
-        spans 50 degrees.
+        of the picture spans 50 degrees.
     """
-    longer = max(width * pixel_aspect, height)  # in heights of a pixel
+    shown = picture or PictureArea(0, 0, width, height)
+    longer = max((shown.right - shown.left) * pixel_aspect, shown.bottom - shown.top)  # in heights of a pixel
     focal_length = _exif_focal_ratio(image_path) * longer if image_path is not None else 0.0
     known = focal_length > 0
     if not known:
@@ -45,7 +54,7 @@ def guess_camera(width: int, height: int, image_path: Path | None = None, pixel_
         model="SIMPLE_PINHOLE" if pixel_aspect == 1.0 else "PINHOLE",
         width=width,
         height=height,
-        params=[*focal_lengths, width / 2, height / 2],
+        params=[*focal_lengths, (shown.left + shown.right) / 2, (shown.top + shown.bottom) / 2],
         has_prior_focal_length=known,
     )
 

@@ -18,7 +18,7 @@ from factorsfm.cli.command import Command, add_footage, add_method, add_objects,
 from factorsfm.cli.progress_line import ProgressLine
 from factorsfm.priors.depth import open_depth
 from factorsfm.priors.masks import open_masks
-from factorsfm.priors.object_masks import open_objects
+from factorsfm.priors.object_masks import FROM_MOTION, open_objects
 from factorsfm.report.result_folder import check_directory, is_earlier_result, remove_result, write_failure
 from factorsfm.support.errors import FactorsfmError, InputError, ReconstructionError
 from factorsfm.support.json_text import json_text
@@ -89,12 +89,13 @@ def _one_thread(workers: int, scheduler: str | None) -> bool:
 
 def _method(arguments: argparse.Namespace, *, several: bool) -> Method:
     """The arguments for all shots; opens camera, prior and masks once, to find errors before the work."""
-    depth, masks, objects = map(_absolute, (arguments.depth, arguments.masks, arguments.objects))
+    depth, masks = map(_absolute, (arguments.depth, arguments.masks))
+    objects = FROM_MOTION if arguments.objects == FROM_MOTION else _absolute(arguments.objects)
     if Options.preset_named(arguments.preset).uses_depth and not (several and depth and Path(depth).is_dir()):
         open_depth(depth, arguments.depth_kind)
     if not (several and masks and Path(masks).is_dir()):
         open_masks(masks)
-    if not several:
+    if not several and objects != FROM_MOTION:
         open_objects(objects)
     camera = open_camera(arguments.camera)
     return Method(

@@ -92,9 +92,9 @@ def add_objects(parser: argparse.ArgumentParser) -> None:
     """Declare the masks of objects."""
     parser.add_argument(
         "--objects",
-        metavar="FOLDER|none",
+        metavar="FOLDER|auto|none",
         help="masks of rigid things that move by themselves, a subfolder for each or numbers in the masks: their "
-        "motion is solved, too (default: none)",
+        "motion is solved, too; auto: things that move beside the scene are found (default: none)",
     )
 
 

@@ -13,6 +13,7 @@ from factorsfm.control.known import KnownPose
 from factorsfm.control.residuals import ALIGNMENT, ControlTerm, Place
 from factorsfm.control.solved_control import SolvedControl, rotation_of
 from factorsfm.control.world_alignment import Correspondences, align_worlds
+from factorsfm.support.semidefinite import solution
 from factorsfm.support.similarity import Similarity
 
 Array = NDArray[np.float64]
@@ -127,7 +128,7 @@ def _with_best_alignment(state: State, term: ControlTerm) -> State:
         normal[np.diag_indices_from(normal)] *= 1.0 + damping
         normal += 1e-12 * np.eye(len(normal))
         control = state.control.copy()
-        control[term.free] -= np.linalg.solve(normal, gradient[mine])
+        control[term.free] -= solution(normal, gradient[mine])
         candidate = replace(state, control=control)
         new_cost = term.cost(candidate)
         if new_cost < cost:

@@ -47,8 +47,8 @@ def write_nuke(shot: Shot, folder: Path) -> None:
 
     The script undistorts the footage with one STMap and renders the points over the undistorted plate. Beside that, it
     distorts the render with the other STMap and lays it over the original footage. A lens without distortion has no
-    STMaps. The principal point is in the camera's window translation, the ratio of the focal lengths in its window
-    scale (the format's pixels are square). An object is an axis that moves its points. Unregistered frames have no
+    STMaps. The principal point is in the camera's window translation, the aspect of its
+    pixels in the format. An object is an axis that moves its points. Unregistered frames have no
     key; a note lists them.
     """
     (folder / POINTS).write_text(_tetrahedra(shot.reconstruction.points, shot.point_size), encoding="ascii")
@@ -93,7 +93,6 @@ def _script(shot: Shot) -> str:
 
 
 def _root(shot: Shot) -> str:
-    width, height = shot.lens.width, shot.lens.height
     return _node(
         "Root",
         inputs=0,
@@ -102,13 +101,19 @@ def _root(shot: Shot) -> str:
         last_frame=shot.last,
         lock_range="true",
         fps=_number(shot.fps),
-        format=f'"{width} {height} 0 0 {width} {height} 1 factorsfm"',
+        format=_format(shot.lens),
     )
+
+
+def _format(lens: Lens) -> str:
+    """The knob of a format with the size and the pixel aspect of the footage."""
+    width, height = lens.width, lens.height
+    return f'"{width} {height} 0 0 {width} {height} {_number(lens.nominal_aspect)} factorsfm"'
 
 
 def _plate(shot: Shot, footage: Path | Sequence | None) -> str:
     if footage is None:
-        return _node("Constant", inputs=0, format=f'"{shot.lens.width} {shot.lens.height} 1"', name="Plate")
+        return _node("Constant", inputs=0, format=_format(shot.lens), name="Plate")
     if isinstance(footage, Sequence):
         file, first, last = footage.pattern, footage.first, footage.last
     else:
@@ -124,6 +129,7 @@ def _plate(shot: Shot, footage: Path | Sequence | None) -> str:
         origset="true",
         frame_mode='"start at"',
         frame=shot.footage_start,
+        format=_format(shot.lens),
         **({"on_error": "black"} if isinstance(footage, Sequence) and footage.missing else {}),
         name="Plate",
     )
@@ -143,7 +149,8 @@ def _camera(shot: Shot) -> str:
         near=_number(shot.clipping[0]),
         far=_number(shot.clipping[1]),
         win_translate=_pair(*_window_translation(lens)),
-        win_scale=_pair(1, 1 / lens.pixel_aspect),
+        # What the format leaves of the ratio of the focal lengths.
+        win_scale=_pair(1, lens.nominal_aspect / lens.pixel_aspect),
         name="Camera",
     )
 

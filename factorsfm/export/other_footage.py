@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 
 from factorsfm.frames.folders import read_image
 from factorsfm.frames.numbering import sequence_of
@@ -81,11 +82,16 @@ def at_size_of(reconstruction: Reconstruction, footage: Path) -> Reconstruction:
         new.rescale(round(x * lens.width), round(y * lens.height))
         return new
 
+    def placed(xy: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray((xy + 0.5) * np.array([x, y]) - 0.5)
+
+    moving = reconstruction.moving
     return replace(
         reconstruction,
         camera=scaled(reconstruction.camera),
         frames=[replace(f, camera=_unless_none(scaled, f.camera)) for f in reconstruction.frames],
-        observation_xy=(reconstruction.observation_xy + 0.5) * np.array([x, y]) - 0.5,
+        observation_xy=placed(reconstruction.observation_xy),
+        moving=None if moving is None else replace(moving, xy=placed(moving.xy)),
         observation_error=reconstruction.observation_error * np.sqrt(x * y),
         noise=None,
         rolled=None,

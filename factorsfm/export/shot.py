@@ -52,6 +52,9 @@ class Defaults:
     numbered: bool = True
 
 
+_NEARLY_SQUARE = 0.05  # relative: the least that cameras have on purpose is that of PAL, 1.067
+
+
 @dataclass(frozen=True)
 class Lens:
     """The pinhole part of the camera, with a film back of a given width.
@@ -86,6 +89,11 @@ class Lens:
     def pixel_aspect(self) -> float:
         """Width over height of a pixel."""
         return self.fy / self.fx
+
+    @property
+    def nominal_aspect(self) -> float:
+        """The pixel aspect for formats and pictures; 1 where a calibration has given nearly square pixels."""
+        return 1.0 if abs(self.pixel_aspect - 1.0) < _NEARLY_SQUARE else self.pixel_aspect
 
     @property
     def right(self) -> float:

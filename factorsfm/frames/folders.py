@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.frames.frame import Frame
-from factorsfm.frames.plates import PLATE_SUFFIXES, Pixels, read_dpx, read_exr
+from factorsfm.frames.plates import PLATE_SUFFIXES, Pixels, plate_pixel_aspect, read_dpx, read_exr
 from factorsfm.frames.sequences import sequence_numbers
 from factorsfm.frames.silence import quiet_opencv
 from factorsfm.frames.tone import eight_bits
@@ -40,14 +40,13 @@ def list_images(folder: Path) -> list[Path]:
 def list_files(folder: Path, suffixes: Collection[str]) -> list[Path]:
     """Files of a folder with one of these suffixes (lower case) in natural order, without hidden files.
 
+    A symbolic link that leads nowhere counts, so that whoever reads it says so: its frame must not be missed silently.
+
     Raises:
         InputError: the name of one of them is not text.
     """
-    found = [
-        path
-        for path in folder.iterdir()
-        if path.suffix.lower() in suffixes and not path.name.startswith(".") and path.is_file()
-    ]
+    named = (path for path in folder.iterdir() if path.suffix.lower() in suffixes and not path.name.startswith("."))
+    found = [path for path in named if path.is_file() or (path.is_symlink() and not path.exists())]
     for path in found:
         if not is_text(path.name):
             raise InputError(f"the file name {path.name!r} in {folder} is not UTF-8; rename the file")
@@ -90,7 +89,7 @@ def watch_folder(folder: Path, end_file: str | Path | None, closed: threading.Ev
             numbers = sequence_numbers([path.name] if last is None else [last.name, path.name])
             index = index + 1 if numbers is None or numbers[-1] <= index else numbers[-1]
             last = path
-            yield Frame(index, image, path.name, path=path)
+            yield Frame(index, image, path.name, path=path, pixel_aspect=stated_pixel_aspect(path))
         else:
             if complete:
                 return
@@ -116,8 +115,9 @@ class _Arrival:
         try:
             status = path.stat()
         except OSError:  # renamed or removed after the listing
-            return _Arrival(None, time.monotonic(), False)
-        state = (status.st_size, status.st_mtime_ns)
+            state = None
+        else:
+            state = (status.st_size, status.st_mtime_ns)
         if before is None or before.state != state:
             return _Arrival(state, time.monotonic(), False)
         return _Arrival(state, before.since, True)
@@ -174,6 +174,15 @@ def read_pixels(path: Path) -> Pixels:
     if image.dtype not in (np.uint8, np.uint16, np.float32):
         raise InputError(f"image {path} has pixels of {image.dtype}; 8 or 16 bits a channel, or float32, are expected")
     return np.asarray(image)
+
+
+def stated_pixel_aspect(path: Path) -> float:
+    """Width of a pixel over its height as an image file says, 1 if it says nothing.
+
+    Raises:
+        InputError: a plate is damaged.
+    """
+    return plate_pixel_aspect(path) if path.suffix.lower() in PLATE_SUFFIXES else 1.0
 
 
 def _is_truncated(data: bytes) -> bool:

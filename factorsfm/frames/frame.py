@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from factorsfm.frames.tone import eight_bits
 from factorsfm.support.errors import InputError
 from factorsfm.support.file_names import check_name
+from factorsfm.support.picture_area import PictureArea
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,6 +28,7 @@ class Frame:
         path: the image file, whose EXIF data may hold the focal length; None if the frame is not from an image file.
         pixel_aspect: width of a shown pixel over its height, 1 for square ones.
         is_field: whether it is one field of an interlaced frame, half of its lines.
+        picture: what of the image is picture, where it has black bars beside it; None if all of it is, or unknown.
 
     Raises:
         InputError: the name is a path that leaves its folder.
@@ -40,6 +42,7 @@ class Frame:
     path: Path | None = None
     pixel_aspect: float = 1.0
     is_field: bool = False
+    picture: PictureArea | None = None
 
     def __post_init__(self) -> None:
         check_name(self.name)

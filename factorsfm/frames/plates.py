@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import math
+import struct
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -11,12 +13,14 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.frames.silence import dropped_if_it_fails
 from factorsfm.support.errors import InputError
 
 Pixels = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float16] | NDArray[np.float32]
 
 PLATE_SUFFIXES = frozenset({".exr", ".dpx"})
 _MOST_PIXELS = 2**30  # of a display window, as OpenCV allows them; a damaged header may ask for more than memory holds
+_DPX_ASPECT, _DPX_UNSET = slice(1628, 1636), 2**32 - 1  # SMPTE 268: two integers, horizontal and vertical
 _LINEAR = 8  # transfer characteristic "linear" of ITU-T H.273, by which FFmpeg reports that of a DPX header
 _FLAT_PARTS = ("scanlineimage", "tiledimage")  # deep parts hold samples in depth, which have to be composited first
 
@@ -33,7 +37,7 @@ def read_exr(path: Path) -> Pixels:
     """
     openexr = import_module("OpenEXR")  # here, since most sources are no plates
     try:
-        with openexr.File(str(path)) as file:
+        with dropped_if_it_fails(), openexr.File(str(path)) as file:
             # `channels` is a view into the file object: what is used of it is copied below, before the file is closed.
             parts = [(part.header, part.channels) for part in file.parts]
             header, colors = _colors(parts, path)
@@ -72,6 +76,31 @@ def _in_display_window(colors: Pixels, header: dict[str, Any], path: Path) -> Pi
     part = colors[max(-y, 0) : max(height - y, 0), max(-x, 0) : max(width - x, 0), ::-1]
     window[max(y, 0) : max(y, 0) + part.shape[0], max(x, 0) : max(x, 0) + part.shape[1]] = part
     return window
+
+
+def plate_pixel_aspect(path: Path) -> float:
+    """Width of a pixel over its height, as the header of an EXR or DPX file says; 1 if it says nothing, or no number.
+
+    Raises:
+        InputError: the file is damaged.
+    """
+    if path.suffix.lower() == ".exr":
+        openexr = import_module("OpenEXR")
+        try:
+            with dropped_if_it_fails(), openexr.File(str(path), header_only=True) as file:
+                aspect = float(file.parts[0].header.get("pixelAspectRatio", 1.0))
+        except (RuntimeError, ValueError, TypeError) as error:
+            raise InputError(f"image {path} cannot be decoded as EXR: damaged") from error
+    else:
+        try:
+            with path.open("rb") as file:
+                header = file.read(_DPX_ASPECT.stop)
+        except OSError as error:
+            raise InputError(f"image {path} cannot be read: {error.strerror}") from error
+        order = ">" if header.startswith(b"SDPX") else "<"
+        across, down = struct.unpack(f"{order}2I", header[_DPX_ASPECT].ljust(8, b"\xff"))
+        aspect = across / down if down not in (0, _DPX_UNSET) and across != _DPX_UNSET else 1.0
+    return aspect if math.isfinite(aspect) and aspect > 0 else 1.0
 
 
 def read_dpx(data: bytes, path: Path) -> Pixels:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.frames.fields import Fields
-from factorsfm.frames.folders import IMAGE_SUFFIXES, read_image
+from factorsfm.frames.folders import IMAGE_SUFFIXES, read_image, stated_pixel_aspect
 from factorsfm.frames.frame import Frame, bgr_image
 from factorsfm.frames.numbering import chosen, numbered_images
 from factorsfm.frames.ranges import checked_range
@@ -43,7 +43,7 @@ def read_frames(
         fields: what is done with interlaced video. "auto" takes its fields apart: twice the frames, half the lines;
             "apart" does so with any video, "blend" keeps frames whole and blends their fields.
         pixel_aspect: width of a shown pixel over its height (of whole frames, upright), in place of what the container
-            says.
+            or the header of a plate says.
 
     Raises:
         InputError: at the call, if an option has no such value, or if the source does not exist, is not a video or
@@ -132,4 +132,4 @@ def _array_frames(
 
 def _folder_frames(images: list[tuple[int, Path]]) -> Iterator[Frame]:
     for number, path in images:
-        yield Frame(number, read_image(path), path.name, path=path)
+        yield Frame(number, read_image(path), path.name, path=path, pixel_aspect=stated_pixel_aspect(path))

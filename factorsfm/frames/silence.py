@@ -1,7 +1,10 @@
-"""OpenCV kept from writing to standard error."""
+"""Libraries kept from writing to standard error, past all logging, what the caller reports as an error."""
 
 from __future__ import annotations
 
+import os
+import sys
+import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -42,3 +45,26 @@ def quiet_opencv() -> Iterator[None]:
             _silence.users -= 1
             if _silence.users == 0:
                 cv2.utils.logging.setLogLevel(_silence.level)
+
+
+_held = threading.Lock()
+
+
+@contextmanager
+def dropped_if_it_fails() -> Iterator[None]:
+    """Hold back what anybody writes to stderr meanwhile: dropped if the block raises an exception, else passed on.
+
+    For libraries that know no log level. One thread at a time, since all of them share the file descriptor.
+    """
+    with _held, tempfile.TemporaryFile() as held:
+        sys.stderr.flush()
+        stderr = os.dup(2)
+        os.dup2(held.fileno(), 2)
+        try:
+            yield
+        finally:
+            sys.stderr.flush()
+            os.dup2(stderr, 2)
+            os.close(stderr)
+        held.seek(0)
+        sys.stderr.write(held.read().decode(errors="replace"))

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.frames.fields import Fields
-from factorsfm.frames.folders import list_images, read_image
+from factorsfm.frames.folders import list_images, read_image, stated_pixel_aspect
 from factorsfm.frames.frame import Frame, bgr_image
 from factorsfm.frames.numbering import chosen, numbered_images
 from factorsfm.frames.ranges import checked_range
@@ -74,7 +74,8 @@ def read_images(
             images = list(enumerate(list_images(folder)))[frames or slice(None)]
         for index, path in images:
             try:
-                yield Frame(index, read_image(path), path.name, path=path)
+                aspect = stated_pixel_aspect(path) if numbered else 1.0  # photographs have square pixels
+                yield Frame(index, read_image(path), path.name, path=path, pixel_aspect=aspect)
             except InputError as error:
                 yield Unusable(index, path.name, str(error).replace(f"image {path}", "it"))
         return

@@ -6,7 +6,7 @@ import itertools
 import logging
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -35,6 +35,7 @@ VIDEO_SUFFIXES = (
 _SEEK_FROM = 100  # frames: decoding fewer is faster than reading the packets of the whole file
 _COMPARED = 16  # frames at the start of the file whose timestamps must be those of its packets
 _PROBED = 24  # frames of an interlaced file from which the order and the moments of its fields are read
+_FILE = "file:"  # the protocol before a path, without which FFmpeg takes some paths for others
 _ANNOUNCED_SHARE = 0.95  # of the frames that the container announces, which is not exact
 
 
@@ -106,7 +107,7 @@ def decode(video: VideoFile, selection: slice, fields: Fields = "auto") -> Itera
             case.
 
     Raises:
-        InputError: the file cannot be opened any more.
+        InputError: the file cannot be opened or read any more.
     """
     apart = fields == "apart" or (fields == "auto" and video.interlaced)
     per_frame = 2 if apart else 1
@@ -117,6 +118,7 @@ def decode(video: VideoFile, selection: slice, fields: Fields = "auto") -> Itera
         if frames is None:
             container.seek(0, stream=stream)
             frames = enumerate(_decoded(container, stream))
+        size = video.path.stat().st_size
         position = -1
         for position, frame in frames:
             if chosen.is_over(position):
@@ -124,6 +126,7 @@ def decode(video: VideoFile, selection: slice, fields: Fields = "auto") -> Itera
             wanted = chosen.of_frame(position)
             if wanted:
                 yield from convert(frame, wanted)
+        _warn_if_grown(position + 1, size, video.path)
         _warn_if_short(position + 1, stream.frames, video.path)
 
 
@@ -198,9 +201,11 @@ def _opened(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
         InputError: it is no container, or holds no video.
     """
     try:
-        container = av.open(f"file:{path}", options={"protocol_whitelist": "file"})
+        container = av.open(f"{_FILE}{path}", options={"protocol_whitelist": "file"})
     except (FFmpegError, OSError, ValueError) as error:
-        raise InputError(f"{path} cannot be decoded as a video; it is damaged or not a video") from error
+        raise InputError(
+            f"{path} cannot be decoded as a video; it is damaged, still being written, or not a video"
+        ) from error
     with container:
         if not container.streams.video:
             raise InputError(f"{path} cannot be decoded as a video; it holds no picture")
@@ -209,7 +214,11 @@ def _opened(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
 
 
 def _decoded(container: InputContainer, stream: VideoStream) -> Iterator[av.VideoFrame]:
-    """Frames from where the container stands. Damaged packets are left out, and a file may end inside of one."""
+    """Frames from where the container stands. Damaged packets are left out, and a file may end inside of one.
+
+    Raises:
+        InputError: the file is gone, such as with the network that held it.
+    """
     stream.thread_type = "AUTO"
     packets = container.demux(stream)
     while True:
@@ -217,12 +226,21 @@ def _decoded(container: InputContainer, stream: VideoStream) -> Iterator[av.Vide
             packet = next(packets, None)
             if packet is None:
                 return
-            frames = packet.decode()
+            frames = _packet_frames(packet)
         except InvalidDataError:
             continue
-        except FFmpegError:
+        except FFmpegError as error:
+            path = Path(container.name.removeprefix(_FILE))
+            try:
+                path.stat()
+            except OSError as gone:
+                raise InputError(f"{path} cannot be read any more: {gone.strerror}") from error
             return
         yield from frames
+
+
+def _packet_frames(packet: av.Packet[VideoStream]) -> list[av.VideoFrame]:
+    return packet.decode()
 
 
 def _problem(path: Path, stream: VideoStream) -> str:
@@ -260,6 +278,13 @@ def _warn_if_short(frames: int, announced: int, path: Path) -> None:
             "or hidden by an edit",
             path, frames, announced,
         )  # fmt: skip
+
+
+def _warn_if_grown(frames: int, size: int, path: Path) -> None:
+    """Log a warning if a file has become longer while its frames were read; size: before that, bytes."""
+    with suppress(OSError):
+        if path.stat().st_size > size:
+            logger.warning("%s: more was written to it while it was read; its first %d frames are used", path, frames)
 
 
 def _from(

@@ -11,10 +11,10 @@ import numpy as np
 from gtsam.symbol_shorthand import X
 from numpy.typing import NDArray
 
-from factorsfm.adjustment.semidefinite import conditioned
 from factorsfm.graph.explicit_graph import SolvedShot, measurements
 from factorsfm.graph.keys import letter_of
 from factorsfm.support.errors import InputError
+from factorsfm.support.semidefinite import root_of, triangular_solution
 from factorsfm.support.threads import OneThreadEach
 
 Array = NDArray[np.float64]
@@ -126,8 +126,8 @@ class _LinearSystem:
             rest = mine[outer[mine]]
             by_outer = np.zeros((len(rows), len(information)))
             by_outer[np.searchsorted(rows, self.row[rest]), place[rest]] = self.value[rest]
-            root = _root(by_point.T @ by_point)
-            halves.append(np.asarray(np.linalg.solve(root, by_point.T @ by_outer), np.float64))
+            root = root_of(by_point.T @ by_point)
+            halves.append(triangular_solution(root, by_point.T @ by_outer))
             if len(halves) == _CHUNK:
                 information -= _squared(halves)
                 halves = []
@@ -158,14 +158,6 @@ def _squared(halves: list[Array]) -> Array | float:
     return np.asarray(half.T @ half)
 
 
-def _root(information: Array) -> Array:
-    """Lower triangular root; rounding errors must not count for less than nothing where hardly anything is known."""
-    try:
-        return np.asarray(np.linalg.cholesky(information))
-    except np.linalg.LinAlgError:
-        return np.asarray(np.linalg.cholesky(conditioned(information)))
-
-
 def _kept(information: Array, sizes: dict[int, int], wanted: list[int]) -> Array:
     """The bordered information of some poses, in their order, the others eliminated.
 
@@ -176,8 +168,8 @@ def _kept(information: Array, sizes: dict[int, int], wanted: list[int]) -> Array
     kept = np.append(np.concatenate([first[key] + np.arange(6) for key in wanted]), len(information) - 1)
     gone = np.setdiff1d(np.arange(len(information)), kept)
     size = np.sqrt(np.diag(information)[gone])
-    root = _root(information[np.ix_(gone, gone)] / np.outer(size, size))
-    half = np.linalg.solve(root, information[np.ix_(gone, kept)] / size[:, None])
+    root = root_of(information[np.ix_(gone, gone)] / np.outer(size, size))
+    half = triangular_solution(root, information[np.ix_(gone, kept)] / size[:, None])
     return np.asarray(information[np.ix_(kept, kept)] - half.T @ half)
 
 

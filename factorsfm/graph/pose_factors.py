@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from factorsfm.graph.factors import pose_from_camera
 from factorsfm.support.errors import InputError
+from factorsfm.support.semidefinite import covariance_of, root_of, triangular_solution
 
 Array = NDArray[np.float64]
 
@@ -123,13 +124,14 @@ def _inverse(matrix: Array) -> Array:
     """Of symmetric matrices (n, d, d) whose rows have units of their own."""
     size = np.sqrt(np.einsum("nii->ni", matrix))
     scale = 1.0 / (size[:, :, None] * size[:, None])
-    return np.asarray(scale * np.linalg.inv(matrix * scale))
+    return np.asarray(scale * covariance_of(matrix * scale))
 
 
 def _positive(matrix: Array, unit: Array) -> Array:
     """The symmetric part of matrices (n, d, d), at least next to nothing in units of positive matrices of the kind."""
-    root = np.linalg.cholesky(unit)
-    inside = np.linalg.inv(root) @ (0.5 * (matrix + matrix.transpose(0, 2, 1)))
-    share, direction = np.linalg.eigh(inside @ np.linalg.inv(root).transpose(0, 2, 1))
+    root = root_of(unit)
+    symmetric = 0.5 * (matrix + matrix.transpose(0, 2, 1))
+    inside = triangular_solution(root, triangular_solution(root, symmetric).transpose(0, 2, 1))
+    share, direction = np.linalg.eigh(inside)
     outside = root @ direction
     return np.asarray((outside * np.maximum(share, _LEAST_SHARE)[:, None]) @ outside.transpose(0, 2, 1))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from factorsfm.graph.added_factors import AddedFactors, MapValues, present_values
 from factorsfm.graph.keys import letter_of
 from factorsfm.graph.linear_system import LinearSystem
+from factorsfm.support.semidefinite import covariance_of
 
 Array = NDArray[np.float64]
 
@@ -44,7 +45,7 @@ def unit_of_length(added: AddedFactors, contents: MapValues) -> tuple[float, flo
         information = design.T @ design
         if not by_unit.any() or np.linalg.cond(information) > 1e16:
             return 1.0, np.inf
-        inverse = np.linalg.inv(information)
+        inverse = covariance_of(information)
         step = inverse @ (design.T @ system.residual)
         std = float(np.sqrt(inverse[-1, -1]))
         unit *= max(0.1, 1.0 + step[-1])

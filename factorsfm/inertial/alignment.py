@@ -17,6 +17,7 @@ from factorsfm.inertial.preintegration import preintegrate
 from factorsfm.inertial.recording import GRAVITY, ImuNoise, ImuRecording
 from factorsfm.support.errors import InputError, ReconstructionError
 from factorsfm.support.rotations import cross_matrices, logarithm
+from factorsfm.support.semidefinite import root_of, triangular_solution
 
 Array = NDArray[np.float64]
 
@@ -183,13 +184,13 @@ def _solve(
     shared, velocities = shared.copy(), velocities.copy()
     for _ in range(_ITERATIONS):
         residual, slope, covariance = _equations(recording, poses, shared, velocities)
-        whitened = np.linalg.solve(np.linalg.cholesky(covariance), np.column_stack([slope, residual]))
+        whitened = triangular_solution(root_of(covariance), np.column_stack([slope, residual]))
         rows = np.vstack([whitened, _priors(recording.noise, shared, gravity_sigma, velocities.size)])
         size = np.linalg.norm(rows[:, :-1], axis=0)
         # The triangle of the unknowns with the residuals as the last column; what they do not explain is its corner.
         triangle = np.asarray(np.linalg.qr(rows / np.append(size, 1.0), mode="r"))
         triangle[:-1, :-1] += 1e-12 * np.eye(len(size))  # what is open altogether stays where it is
-        inverse = np.linalg.inv(triangle[:-1, :-1]) / size[:, None]
+        inverse = triangular_solution(triangle[:-1, :-1], np.eye(len(size))) / size[:, None]
         step = -inverse @ triangle[:-1, -1]
         # A ratio must stay positive; far from the solution half of it is enough of a step.
         shared += step[:_SHARED] * min(1.0, shared[_RHO] / 2 / max(abs(step[_RHO]), 1e-300))

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from factorsfm.inertial.recording import ImuRecording
 from factorsfm.support.errors import InputError, ReconstructionError
 from factorsfm.support.rotations import cross_matrices, exponential, logarithm, nearest_rotation
+from factorsfm.support.semidefinite import covariance_of, deviations
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -223,7 +224,7 @@ def _fit(recording: ImuRecording, gyroscope: _Gyroscope, time: Array, turns: Arr
     covariance[held], covariance[:, held] = 0.0, 0.0
     timing = ImuTiming(
         time_offset=offset,
-        time_offset_sigma=float(np.sqrt(covariance[0, 0])),
+        time_offset_sigma=float(deviations(covariance)[0]),
         cam_from_imu=rotation,
         rotation_covariance=covariance[1:4, 1:4],
         gyroscope_bias=bias,
@@ -244,7 +245,7 @@ def _normal_equations(
     """
     loose = np.diag(1.0 / np.repeat([_REACH, np.pi, bias_sigma], [1, 3, 3]) ** 2)  # holds what the motion leaves open
     rows = slope.reshape(-1, 7)
-    inverse = np.linalg.inv(rows.T @ rows / spread**2 + loose)
+    inverse = covariance_of(rows.T @ rows / spread**2 + loose)
     scores = np.einsum("nri,nr->ni", slope, residual) / spread**2
     lags = min(len(scores) - 1, int(np.ceil(2 * _SPAN / np.median(np.diff(time[:, 0])))))
     middle = scores.T @ scores + loose

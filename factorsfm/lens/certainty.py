@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.noise import image_cells
 from factorsfm.adjustment.observations import DISTORTION
-from factorsfm.adjustment.semidefinite import squared_deviations
 from factorsfm.adjustment.state import LENS_SIZE
+from factorsfm.support.semidefinite import deviations, squared_deviations
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -33,7 +33,7 @@ def lens_deviations(
     groups = len(adjustment.state.log_focal)
     covariances = [*lens_covariances(adjustment), _left_out_covariance(adjustment)]
     std = np.full((len(covariances), groups + LENS_SIZE), np.nan)
-    std[:, adjustment.free_optics] = np.sqrt([c.diagonal() for c in covariances])
+    std[:, adjustment.free_optics] = [deviations(c) for c in covariances]
     evidence = 0.0
     if guess is not None:
         free = np.isin(adjustment.free_optics, groups + np.arange(LENS_SIZE)[part])

@@ -31,6 +31,7 @@ _LARGEST_RATIO = 4.0  # of the focal length to the guess
 # Of log focal length: up to this a camera that turns keeps what it has found, since through the guess it would seem to
 # move; beyond, it turns by so little that the guess explains the images as well.
 _TURNING_STD = 1.0
+_CONTRADICTION = 3.0  # standard deviations between what the shot and what EXIF data say
 _MISFIT = 1.5  # of the standard deviation above which a solution is doubted
 # Distortion is believed where neither random errors explain it nor those of tracks that move together: an actor without
 # a mask looks like a displacement of 1 to 4 thousandths of the width at the outermost tracks.
@@ -196,8 +197,9 @@ def _concluded(
     logger.info("focal length %s pixels within %s %%, guess %s", lens.focal, 100 * focal_std, guess.focal)
     misfit = sigma if sigma > _MISFIT * options.polish.doubtful_px else 0.0
     sound = not misfit and np.abs(np.log(lens.focal / guess.focal)).max() <= np.log(_LARGEST_RATIO)
+    contradicted = _contradicted(lens.focal, focal_std, first_focal) if sound and not held else 0.0
     if best.known and sound:
-        return LensEstimate(lens, focal_std, shape_std, misfit, determined=True)
+        return LensEstimate(lens, focal_std, shape_std, misfit, determined=True, contradicted_px=contradicted)
     # In a long valley a standard deviation says little.
     counts = sound and float(best.std[: best.groups].max()) < GIVEN_FOCAL_STD
     focal, rough = _kept_focal(lens.focal, focal_std, first_focal, counts=bool(counts))
@@ -206,7 +208,9 @@ def _concluded(
     if not rough:
         shape_std = np.full(LENS_SIZE, np.nan)
     final = Lens(focal, lens.shape if rough else guess.shape)
-    return LensEstimate(final, focal_std, shape_std, misfit, determined=False, rough=rough)
+    return LensEstimate(
+        final, focal_std, shape_std, misfit, determined=False, rough=rough, contradicted_px=contradicted
+    )  # fmt: skip
 
 
 def _settled(
@@ -247,6 +251,13 @@ def _kept_focal(found: Array, std: Array, first: tuple[Array, float], *, counts:
         return focal, False
     share = first_std**2 / (first_std**2 + std**2)
     return np.asarray(found**share * focal ** (1.0 - share)), True
+
+
+def _contradicted(found: Array, std: Array, first: tuple[Array, float]) -> float:
+    """The first focal length, pixels, where it is more than a guess and the shot says another one; else 0."""
+    focal, first_std = first
+    off = np.abs(np.log(found / focal)) > _CONTRADICTION * np.hypot(std, first_std)
+    return float(np.median(focal)) if 0.0 < first_std <= GIVEN_FOCAL_STD and bool(off.all()) else 0.0
 
 
 def _displacement(adjustment: BundleAdjustment, guess: Array) -> float:

@@ -50,6 +50,8 @@ class LensEstimate:
         rough: whether they are not, but the shot knows more than the guess: means of both, weighted by their variances.
         zoom_std: relative standard deviation of the ratio of the longest to the shortest focal length where a zoom was
             looked for, whether one was found or not; None: none was. The course of a zoom is an estimate in any case.
+        contradicted_px: the focal length of EXIF data or of a camera file that the shot contradicts; 0: none.
+        announced: False of a zoom that was recognised without being asked for.
     """
 
     lens: Lens
@@ -59,6 +61,13 @@ class LensEstimate:
     determined: bool
     rough: bool = False
     zoom_std: float | None = None
+    contradicted_px: float = 0.0
+    announced: bool = True
+
+    @property
+    def zooms(self) -> bool:
+        """Whether a zoom was found: each frame has a focal length of its own."""
+        return self.zoom_std is not None and len(self.lens.focal) > 1
 
 
 def shape_sigmas(freedom: LensFreedom, width: float) -> Array:

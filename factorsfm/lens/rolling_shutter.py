@@ -30,6 +30,7 @@ from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.motion.shot_kind import CLEAR_GAIN, LEAST_GAIN, Motion, translation_gain
 from factorsfm.support.options import Options
 from factorsfm.support.rotations import exponential
+from factorsfm.support.semidefinite import solution
 from factorsfm.support.status import ShotKind
 
 Array = NDArray[np.float64]
@@ -172,7 +173,7 @@ def turns_before_shutter(adjustment: BundleAdjustment, motion: Motion, options: 
     """
     if motion.gain >= _TURNING_GAIN:
         return None
-    few, _ = some_frames(motion.rotation_only, adjustment.observations)
+    _, few, _ = some_frames(motion.rotation_only, adjustment.observations)
     if _turning(on_some_frames(adjustment), few, options, CLEAR_GAIN) is None:
         return None
     return _turning(adjustment, motion.rotation_only, options, LEAST_GAIN)
@@ -241,7 +242,7 @@ def seen_at_once(state: State, observations: Observations, weight: Array, *, mov
         information = np.add.reduceat(gain @ jacobian, first)
         gradient = np.add.reduceat(gain @ residual[:, :, None], first)
         step = np.zeros((len(first), 6))
-        step[:, :free] = -np.linalg.solve(information, gradient)[:, :, 0]
+        step[:, :free] = -solution(information, gradient)[:, :, 0]
         turn = exponential(-step[:, :3])
         translation = np.einsum("kij,kj->ki", turn, state.translation - step[:, 3:])
         state = replace(state, rotation=turn @ state.rotation, translation=translation)

@@ -58,7 +58,7 @@ def found_lens(adjustment: BundleAdjustment, options: PolishOptions, sigmas: Arr
 
 def _bends(straight: State, cost: float, adjustment: BundleAdjustment, options: PolishOptions, sigmas: Array) -> bool:
     """Whether some distortion beside the best lens without it makes the few frames fit better."""
-    _, few = some_frames(adjustment.state, adjustment.observations)
+    _, _, few = some_frames(adjustment.state, adjustment.observations)
     free = BundleAdjustment(
         straight, few, replace(options, iterations=_ITERATIONS, tolerance=_TOLERANCE), ErrorModel(adjustment.sigma),
         free=Free(focal=True), known=Known(lens=LensPrior(straight.lens, sigmas)),
@@ -78,7 +78,7 @@ def search_lens(
         sigmas: (6,) prior standard deviations of the shape around that of the solution; None: it is constant.
     """
     guess = Lens.of(adjustment.state)
-    state, few = some_frames(adjustment.state, adjustment.observations)
+    _, state, few = some_frames(adjustment.state, adjustment.observations)
     options = replace(options, iterations=_ITERATIONS, tolerance=_TOLERANCE)
     known = Known(lens=None if sigmas is None else LensPrior(guess.shape, sigmas))
 

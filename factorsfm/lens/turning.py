@@ -42,7 +42,9 @@ def turning_camera(guess: State, observations: Observations, options: PolishOpti
     """
     fits = []
     for factor in _FACTORS:
-        part, few = some_frames(_chained(through(guess, factor * np.exp(guess.log_focal)), observations), observations)
+        _, part, few = some_frames(
+            _chained(through(guess, factor * np.exp(guess.log_focal)), observations), observations
+        )
         for sigma in _SIGMAS_PX:
             solved = BundleAdjustment(
                 part, few, replace(options, iterations=_ITERATIONS, tolerance=1e-3), ErrorModel(sigma),

@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import FocalPrior
-from factorsfm.adjustment.semidefinite import squared_deviations
+from factorsfm.adjustment.some_frames import some_frames
 from factorsfm.adjustment.state import LENS_SIZE, State
 from factorsfm.lens.certainty import lens_covariances
-from factorsfm.lens.solver import LensSolver
+from factorsfm.lens.solver import LensSolver, NotInvertibleError
 from factorsfm.motion.shot_kind import LEAST_GAIN, translation_gain
 from factorsfm.support.options import PolishOptions
+from factorsfm.support.semidefinite import squared_deviations
 
 Array = NDArray[np.float64]
 
@@ -33,6 +34,8 @@ _ROUNDS = 2
 _CLEARLY = 0.95  # of the cost of the solution from a turning camera, below which that from the map is preferred
 _COMPONENTS = 4  # slow cosines in which a zoom must be significant
 _LEAST_EVIDENCE = 16.0  # squared standard deviations
+# Of the cost with one focal length: below, there is no doubt of a zoom, or a reason to try one.
+_CERTAIN, _SUSPECTED = 0.5, 0.8
 _LEAST_ZOOM = 0.02  # of log focal length: moving things and focus pulls change it by less
 
 
@@ -45,12 +48,21 @@ class Zoom:
         adjustment: converged with it, a focal length for every frame.
         information: (k, k) of the log focal lengths from the smoothness of the change.
         std: relative standard deviation of the ratio of the longest to the shortest focal length.
+        turns: whether the camera does no more than turn.
+        certain: whether there is no doubt of it, where nobody has announced it.
     """
 
     found: bool
     adjustment: BundleAdjustment
     information: Array
     std: float
+    turns: bool
+    certain: bool = True
+
+    @property
+    def ratio(self) -> float:
+        """The longest focal length over the shortest."""
+        return float(np.exp(np.ptp(self.adjustment.state.log_focal)))
 
 
 def find_zoom(known: BundleAdjustment, times: Array, options: PolishOptions) -> Zoom | None:
@@ -61,7 +73,7 @@ def find_zoom(known: BundleAdjustment, times: Array, options: PolishOptions) -> 
     """
     if len(times) < _SHORTEST:
         return None
-    best, spread = _most_probable(known, times, options)
+    best, spread, turns = _most_probable(known, times, options)
     std, evidence = _certainty(best)
     change = float(np.ptp(best.state.log_focal))
     logger.info(
@@ -71,25 +83,61 @@ def find_zoom(known: BundleAdjustment, times: Array, options: PolishOptions) -> 
     found = change > _LEAST_ZOOM and min(evidence, (change / std) ** 2) > _LEAST_EVIDENCE
     settled = BundleAdjustment(best.state, best.observations, options, best.errors)
     settled.solve()
-    return Zoom(found, settled, _information(times, spread), std)
+    return Zoom(found, settled, _information(times, spread), std, turns)
 
 
-def _most_probable(known: BundleAdjustment, times: Array, options: PolishOptions) -> tuple[BundleAdjustment, float]:
-    """The best solution with a focal length for every frame, and the spread of the acceleration of their logarithms.
+def unannounced_zoom(
+    known: BundleAdjustment, fixed: BundleAdjustment, times: Array, options: PolishOptions, *, doubtful: bool
+) -> Zoom | None:
+    """A zoom that nobody has asked for, None where one focal length explains the tracks as well.
+
+    Args:
+        known: as in `find_zoom`; fixed: the best solution with one focal length.
+        doubtful: whether that does not fit. One that does is none where the camera of it moves, and one that turns and
+            zooms does as well: a zoom looks like a way towards a wall, and is the simpler reading.
+    """
+    if len(times) < _SHORTEST or not (doubtful or _turns_and_zooms(fixed, times, options)):
+        return None
+    zoom = find_zoom(known, times, options)
+    if zoom is None or not zoom.found:
+        return None
+    share = _share_of_cost(zoom, fixed)
+    logger.info("a zoom of %.2f that nobody announced costs %.2f of what one focal length does", zoom.ratio, share)
+    simpler = zoom.turns and not doubtful
+    return replace(zoom, certain=simpler or share < _CERTAIN) if simpler or share < _SUSPECTED else None
+
+
+def _share_of_cost(zoom: Zoom, fixed: BundleAdjustment) -> float:
+    """Cost of the tracks with a zoom over that with one focal length, judged with the same noise."""
+    with_one, with_zoom = (float(p.observation_costs().sum()) for p in _at_one_scale(fixed, zoom.adjustment))
+    return with_zoom / max(with_one, 1e-300)
+
+
+def _turns_and_zooms(fixed: BundleAdjustment, times: Array, options: PolishOptions) -> bool:
+    """Whether a camera that turns and zooms explains a few frames as well as one that moves with one focal length."""
+    frames, part, few = some_frames(fixed.state, fixed.observations)
+    general = BundleAdjustment(part, few, options, fixed.errors)
+    try:
+        _, turning = _turning_start(general, times[frames], options)
+    except NotInvertibleError:
+        return False
+    if float(np.ptp(turning.log_focal)) < _LEAST_ZOOM:
+        return False
+    gain = translation_gain(*_at_one_scale(BundleAdjustment(turning, few, options, fixed.errors), general))
+    logger.info("translation explains %.2f more of an observation than turning and zooming", gain)
+    return gain < LEAST_GAIN
+
+
+def _most_probable(
+    known: BundleAdjustment, times: Array, options: PolishOptions
+) -> tuple[BundleAdjustment, float, bool]:
+    """The best solution with a focal length for every frame, the spread of the acceleration of their logarithms, and
+    whether the camera only turns in it.
 
     A zoom looks like motion along the view axis, and so the map's motion is wrong where there is one. The start is a
     camera that turns and zooms before points at one distance; translation and distances are freed from there.
     """
-    state, count = known.state, len(times)
-    own = replace(state, log_focal=np.repeat(state.log_focal, count), group=np.arange(count))
-    flat = replace(
-        own,
-        translation=np.zeros_like(state.translation),
-        inverse_distance=np.full(len(state.inverse_distance), float(np.median(state.inverse_distance))),
-    )
-    prior = FocalPrior(own.log_focal, _information(times, _FIRST_SPREAD) + _level(count, _TURNING_LEVEL_SIGMA))
-    few = LensSolver(known.observations, replace(options, iterations=_FLAT_ITERATIONS), prior)
-    start = few.solved(flat, 1.0, np.zeros(LENS_SIZE), moves=False).state
+    own, start = _turning_start(known, times, options)
     zooms = _ZoomSolver(known.observations, own.log_focal, times, options)
     turning, turning_spread = zooms.solved(start, known.sigma, moves=False)
     best, spread = zooms.solved(turning.state, known.sigma)
@@ -101,9 +149,23 @@ def _most_probable(known: BundleAdjustment, times: Array, options: PolishOptions
     )  # fmt: skip
     if other_cost < _CLEARLY * cost:
         best, spread = other, other_spread
-    if translation_gain(*_at_one_scale(turning, best)) < LEAST_GAIN:
-        best, spread = turning, turning_spread
-    return best, spread
+    turns = translation_gain(*_at_one_scale(turning, best)) < LEAST_GAIN
+    return (turning, turning_spread, True) if turns else (best, spread, False)
+
+
+def _turning_start(known: BundleAdjustment, times: Array, options: PolishOptions) -> tuple[State, State]:
+    """The state with a focal length for every frame; and a camera that turns and zooms before points at one distance,
+    which explains most."""
+    state, count = known.state, len(times)
+    own = replace(state, log_focal=np.repeat(state.log_focal, count), group=np.arange(count))
+    flat = replace(
+        own,
+        translation=np.zeros_like(state.translation),
+        inverse_distance=np.full(len(state.inverse_distance), float(np.median(state.inverse_distance))),
+    )
+    prior = FocalPrior(own.log_focal, _information(times, _FIRST_SPREAD) + _level(count, _TURNING_LEVEL_SIGMA))
+    few = LensSolver(known.observations, replace(options, iterations=_FLAT_ITERATIONS), prior)
+    return own, few.solved(flat, 1.0, np.zeros(LENS_SIZE), moves=False).state
 
 
 def _certainty(solved: BundleAdjustment) -> tuple[float, float]:

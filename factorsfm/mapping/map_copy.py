@@ -31,6 +31,7 @@ class MapUpdate:
         focal: a better focal length (pixels), None where it stays as it is.
         burn_ins: tracks of what is laid over the images.
         moving: how many tracks move by themselves, so that a young map begins again without them.
+        begins_again: whether a young map does, without those or without burn-ins: poses before are as wrong as it was.
         mirrored: see `UpdateResult`.
         unit: how many times as long lengths are now, all others of the map included.
         added: the caller's factors as the next update needs them; offered: how many of those that waited were tried;
@@ -51,6 +52,7 @@ class MapUpdate:
     focal: float | None = None
     burn_ins: Index = field(default_factory=lambda: np.zeros(0, np.int64))
     moving: int = 0
+    begins_again: bool = False
     mirrored: bool = False
     no_prior: bool = False
     unit: float = 1.0
@@ -62,7 +64,10 @@ class MapUpdate:
     @property
     def note(self) -> str:
         """What became of the map, where that is out of the ordinary."""
-        return f"{self.moving} tracks move by themselves, the map begins again without them" if self.moving else ""
+        if not self.begins_again:
+            return ""
+        count, what = (self.moving, "move by themselves") if self.moving else (len(self.burn_ins), "rest in the image")
+        return f"{count} tracks {what}, the map begins again without them"
 
 
 @dataclass(frozen=True, slots=True)

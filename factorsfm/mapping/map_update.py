@@ -91,7 +91,8 @@ def _extended(copy: MapCopy, graph: KeyframeGraph) -> MapUpdate:
     result = _solved(copy, graph, images, constant, ids, iterations)
     burn_ins, removed, moving = burn_ins_of(result.window), ids[:0], 0
     scene = np.setdiff1d(ids, burn_ins) if len(burn_ins) else scene_alone(copy, images, result.window, mapped)
-    if not np.array_equal(scene, ids):
+    begins_again = not np.array_equal(scene, ids)
+    if begins_again:
         tried = ids if len(burn_ins) else mapped
         moving = 0 if len(burn_ins) else len(mapped) - len(scene)
         ids = lifted_anew(copy, images, scene)
@@ -104,7 +105,13 @@ def _extended(copy: MapCopy, graph: KeyframeGraph) -> MapUpdate:
     if len(others):
         update = solve_alone(copy, images, update, others, guidance, contradicting)
     removed = np.concatenate([update.removed, removed, laid_over])
-    return replace(update, removed=np.unique(removed), burn_ins=np.union1d(burn_ins, laid_over), moving=moving)
+    return replace(
+        update,
+        removed=np.unique(removed),
+        burn_ins=np.union1d(burn_ins, laid_over),
+        moving=moving,
+        begins_again=begins_again and len(copy.keyframes) <= YOUNG_KEYFRAMES,
+    )
 
 
 def _solved(

@@ -69,7 +69,7 @@ class Mapper(IncrementalMapper):
         self.note = ""  # what became of the map with the last image, where that is out of the ordinary
         self.unit = 1.0  # how many times as long lengths are as when the map began
         self.additions = Additions()
-        self.starts_anew = False  # whether the map was given up with the last image
+        self.starts_anew = self.begins_again = False  # with the last image: given up; gone on without what bent it
         self._graph = graph
         self._update: Future[MapUpdate] | None = None
         self._due, self._advanced = 0, -1  # number of images for which `advance` was called last
@@ -139,9 +139,8 @@ class Mapper(IncrementalMapper):
         if self._advanced == len(self.images):
             return
         self._advanced = len(self.images)
-        self.burn_ins = np.zeros(0, np.int64)
-        self.new_points = 0
-        self.note, self.starts_anew = "", False
+        self.burn_ins, self.new_points = np.zeros(0, np.int64), 0
+        self.note, self.starts_anew, self.begins_again = "", False, False
         if self._update is not None and len(self.images) >= self._due:
             self._take_over()
 
@@ -365,6 +364,7 @@ class Mapper(IncrementalMapper):
             return
         self.keyframes.append(update.position)
         self.note = self.additions.follow(update) or update.note or self.note
+        self.begins_again |= update.begins_again
         if update.unit != 1.0:
             self._rescale(update.unit)
         before = image.pose

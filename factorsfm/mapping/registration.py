@@ -14,6 +14,7 @@ from factorsfm.graph.factors import image_depth_factor, image_reprojection_facto
 from factorsfm.graph.image_pose import AFFINE, POSE, solve_pose_and_affine
 from factorsfm.priors.affine import fit_affine
 from factorsfm.priors.image_depth import ImageDepth
+from factorsfm.support.semidefinite import covariance_of, solution
 
 Array = NDArray[np.float64]
 
@@ -133,7 +134,7 @@ def _turned(points: Array, observed: Array, rotation: Array, translation: Array,
         jacobian = by_pose[:3].reshape(3, -1)
         weighted = (by_pose[:3] * weight).reshape(3, -1)
         normal = weighted @ jacobian.T
-        step = np.linalg.solve(normal + 1e-9 * np.trace(normal) * np.eye(3), weighted @ residual.ravel())
+        step = solution(normal + 1e-9 * np.trace(normal) * np.eye(3), weighted @ residual.ravel())
         turn = cv2.Rodrigues(step)[0]
         rotation, q = turn @ rotation, turn @ q
     return rotation
@@ -176,7 +177,7 @@ def _align(
             normal, gradient = weighted @ jacobian.T, weighted @ residual.ravel()
         else:
             damping = max(10.0 * damping, 1e-4)
-        step = -np.linalg.solve(normal + damping * np.diag(normal.diagonal() + 1e-12), gradient)
+        step = -solution(normal + damping * np.diag(normal.diagonal() + 1e-12), gradient)
         turn = cv2.Rodrigues(-step[:3])[0]
         candidate = turn @ rotation, turn @ (translation - step[3:])
     return rotation, translation, normal
@@ -210,7 +211,7 @@ def _refine(
     threshold = inlier_threshold(error, inlier_px)
     inliers = error < threshold
     typical = float(np.median(error[inliers])) if inliers.any() else float("inf")
-    covariance = np.asarray(np.linalg.inv(information + 1e-9 * np.diag(information.diagonal() + 1e-12)), np.float64)
+    covariance = covariance_of(information + 1e-9 * np.diag(information.diagonal() + 1e-12))
     return Registration(rotation, translation, inliers, typical, threshold, covariance)
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.residuals import cauchy
+from factorsfm.motion.neighbours import places, share_nearby
 
 _SIGMAS = 10.0  # of an observation: a typical error beyond is not one of tracking
 _SPREADS = 3.0  # robust standard deviations of the logarithms of the points' errors, beyond which one stands out
@@ -22,14 +23,52 @@ _LEAST, _LEAST_SHARE = 8, 0.02  # points: fewer do no harm
 # Of the cost of the others' observations, if they are explained alone. Where nothing moves, it is 0.998 and more of it;
 # beside people 0.93 to 0.97.
 SPOILT = 0.98
+# Of the neighbours of a track inside of a thing, which stand out, too, if one more did not. Walkers have 25 to 400 such
+# tracks; where nothing moves, tracks that slide in the dark or in reflections are two at most.
+_INSIDE = 0.8
 
 
 def standing_out(adjustment: BundleAdjustment) -> NDArray[np.bool_]:
     """(n,) which points a solution does not explain at all; none where they are too few to do harm."""
     size = log_errors(adjustment.observations, adjustment.reprojection_errors())
-    center, spread = center_and_spread(size)
-    found = (size > np.log(_SIGMAS * adjustment.sigma)) & (size > center + _SPREADS * spread)
+    found = _beyond(size, size, adjustment.sigma)
     return np.asarray(found & (found.sum() >= max(_LEAST, _LEAST_SHARE * len(found))))
+
+
+def moving_together(
+    observations: Observations,
+    errors: NDArray[np.float64],
+    sigma: float,
+    *,
+    rests_on: NDArray[np.int64],
+    left_out: NDArray[np.int64],
+) -> NDArray[np.bool_]:
+    """(n,) which points move by themselves: a solution does not explain them at all, nor what is around them.
+
+    What slides along an edge stands out alone, a thing with all of its tracks: some are amid others that stand out,
+    and the rest beside these.
+
+    Args:
+        errors: (m,) of the observations under cameras that rest on some of the points, pixels.
+        sigma: of a coordinate of what they rest on, pixels.
+        rests_on: these points; left_out: points without which they fit better.
+    """
+    size = log_errors(observations, errors)
+    found = _beyond(size, size[rests_on], sigma)
+    if not found.any():
+        return found
+    where = places(observations)
+    inside = found.copy()
+    inside[found] = share_nearby(where, found, found) > _INSIDE
+    inside[left_out] = found[left_out]
+    found[found] = share_nearby(where, inside, found) > 0.0
+    return np.asarray(found & (inside.sum() >= _LEAST))
+
+
+def _beyond(size: NDArray[np.float64], usual: NDArray[np.float64], sigma: float) -> NDArray[np.bool_]:
+    """Which logarithms of errors are beyond those of tracking, and beyond the usual ones."""
+    center, spread = center_and_spread(usual)
+    return np.asarray((size > np.log(_SIGMAS * sigma)) & (size > center + _SPREADS * spread))
 
 
 def as_exact(adjustment: BundleAdjustment, members: NDArray[np.bool_]) -> NDArray[np.bool_]:

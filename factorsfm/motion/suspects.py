@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 
 from factorsfm.adjustment.observations import Observations
 from factorsfm.motion.moving import center_and_spread, log_errors
+from factorsfm.motion.neighbours import places, share_nearby
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-_NEIGHBOURS = 10  # suspects, with the one that is judged
-_REACH, _FRAMES = 8, 16  # a step of an eighth of the image leads as far away as one of so many frames
 # More than half of the neighbours must be as exact as most of the scene: within a robust standard deviation of the
 # logarithms of its errors, where 84 % of its own tracks are. One more that is not is counted: a few may fit by chance.
 # On rendered shots 83 to 90 % of half an image that is masked by mistake come back so, and 14 % of an actor who hardly
@@ -38,23 +37,5 @@ def agreeing(observations: Observations, errors: Array, suspected: Flags) -> Fla
     center, spread = center_and_spread(size[~suspected])
     exact = size[suspected] < center + _EXACT * max(spread, _LEAST_SPREAD)
     result = ~suspected
-    result[suspected] = exact & (_share_nearby(_places(observations)[suspected], exact) > _SHARE)
+    result[suspected] = exact & (share_nearby(places(observations)[suspected], exact) > _SHARE)
     return result
-
-
-def _places(observations: Observations) -> Array:
-    """(n, 3) where in the image, and when, each point is halfway through its track, in steps of equal weight."""
-    first = observations.first
-    middle = (first + np.append(first[1:], len(observations.point)) - 1) // 2
-    pixels = observations.pixels[middle]
-    step = max(float(np.ptp(pixels, axis=0).max()) / _REACH, 1e-9)
-    return np.column_stack([pixels / step, observations.frame[middle] / _FRAMES])
-
-
-def _share_nearby(places: Array, exact: Flags) -> Array:
-    """(n,) share of those around each place (n, 3) that are exact, if one more were not."""
-    count = min(_NEIGHBOURS, len(places))
-    found = [
-        exact[np.argpartition(np.linalg.norm(places - place, axis=1), count - 1)[:count]].sum() for place in places
-    ]
-    return np.array(found) / (count + 1)

@@ -8,6 +8,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from factorsfm.objects.scale import ScaleSource
+
 
 @dataclass(frozen=True, slots=True)
 class ObjectFrame:
@@ -39,6 +41,7 @@ class ObjectResult:
         reprojection_error: median over its observations, pixels.
         scale_std: relative standard deviation of the distance from the camera, and with it of the object's size; None
             where nothing gives the scale beside that of the scene: it is at the scene's median depth then.
+        scale_from: "rest": from a time at which it rests in the scene; "prior": from the depth prior; None: nothing.
         note: a sentence on where the scale comes from.
     """
 
@@ -48,6 +51,7 @@ class ObjectResult:
     colors: NDArray[np.uint8]
     reprojection_error: float
     scale_std: float | None
+    scale_from: ScaleSource | None
     note: str
 
     @property

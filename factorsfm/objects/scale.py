@@ -1,14 +1,16 @@
-"""The scale of an object beside that of the scene: from the depth prior, which sees both in the same maps."""
+"""The scale of an object beside that of the scene, and the depth prior, which sees both in the same maps."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+ScaleSource = Literal["rest", "prior"]
 
 _LEAST_VALUES = 5  # of a map on the object
 _LARGEST_STD = 0.5  # relative: beyond, the median depth of the scene says as much
@@ -20,6 +22,7 @@ class PriorOnScene:
 
     Attributes:
         scale, shift, scale_std, shift_std, sigma, smooth: as in `PriorFit`.
+        on_things: relative error of the depth of a thing that stands out from the scene, which the scene does not show.
     """
 
     scale: float
@@ -28,6 +31,7 @@ class PriorOnScene:
     shift_std: float
     sigma: float
     smooth: float
+    on_things: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,12 +39,13 @@ class Scale:
     """Units of the scene in one unit of the object.
 
     Attributes:
-        std: relative; frames: number of maps that it comes from.
+        std: relative; frames: number of frames, or of maps, that it comes from; source: what gives it.
     """
 
     value: float
     std: float
     frames: int
+    source: ScaleSource
 
 
 def scale_from_prior(
@@ -67,10 +72,10 @@ def scale_from_prior(
         near = float(np.median(inverse[good]))
         ratios.append(float(np.median(1.0 / (inverse[good] * depth[good]))))
         errors = np.array([prior.sigma, prior.smooth, prior.shift_std, prior.scale_std * near]) / (prior.scale * near)
-        stds.append(float(np.linalg.norm(errors)))
+        stds.append(float(np.hypot(np.linalg.norm(errors), prior.on_things)))
     if not ratios:
         return None
     value = float(np.median(ratios))
     spread = 1.4826 * float(np.median(np.abs(np.array(ratios) / value - 1.0)))
     std = max(float(np.median(stds)), spread)
-    return Scale(value, std, len(ratios)) if std < _LARGEST_STD else None
+    return Scale(value, std, len(ratios), "prior") if std < _LARGEST_STD else None

@@ -12,24 +12,24 @@ from numpy.typing import NDArray
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.objects.growth import grown
 from factorsfm.objects.object_result import ObjectFrame, ObjectResult
+from factorsfm.objects.rest import Sighting, scale_at_rest
 from factorsfm.objects.scale import PriorOnScene, Scale, scale_from_prior
-from factorsfm.objects.start import LEAST_TRACKS, object_start
+from factorsfm.objects.smooth_errors import adjoint, smooth_error_covariance
+from factorsfm.objects.start import LEAST_FRAMES, LEAST_TRACKS, object_start
 from factorsfm.polish.polish import polish
 from factorsfm.polish.polished import Polished
 from factorsfm.support.errors import ReconstructionError
 from factorsfm.support.options import Options
-from factorsfm.support.rotations import cross_matrices
 from factorsfm.support.status import ShotKind
 from factorsfm.tracks.image_tracks import ImageTracks, seen_by
 
 Array = NDArray[np.float64]
 
-_LEAST_FRAMES = 5
 # On rendered boxes: with 5.6 pixels of perspective and more all starts are right, by margins of 31 and more. With up to
 # 4.7, one in three is wrong, by margins of up to 77.
 _LEAST_PERSPECTIVE_PX, _LEAST_MARGIN = 5.2, 25.0
-_LARGEST_ROTATION_STD = 1.2  # degrees. With 0.9 the path is still right to 1 %, with 1.5 wrong by 7 %, and the rotation
-# by 30 degrees: the true errors are several times as large.
+# Degrees. With 0.9 the path of rendered boxes is right to 1 %; with 1.5 wrong by 7 %, and the rotation by 30 degrees.
+_LARGEST_ROTATION_STD = 1.2
 # Of the tracks on it. One figure with motion blur has 0.98 and more, two that walk in opposite directions 0.5.
 _RIGID_SHARE, _EXPLAINED_PX = 0.8, 1.0
 _TOO_FAR = 0.3  # inverse distance over the median: nothing of a thing is three times as far away as the rest
@@ -68,9 +68,9 @@ def solve_object(
         ReconstructionError: it cannot be solved; the message says why.
     """
     images = [image for image in images if image.position in cameras and len(image.ids) >= LEAST_TRACKS]
-    if len(images) < _LEAST_FRAMES:
+    if len(images) < LEAST_FRAMES:
         raise ReconstructionError(
-            f"{len(images)} frames have {LEAST_TRACKS} tracks on it, at least {_LEAST_FRAMES} needed"
+            f"{len(images)} frames have {LEAST_TRACKS} tracks on it, at least {LEAST_FRAMES} needed"
         )
     turns = np.array([cameras[image.position].cam_from_world.rotation.matrix() for image in images])
     start = object_start(images, turns, options.polish)
@@ -133,22 +133,24 @@ def _result(
     good = _on_object(polished)
     points = state.points[good]
     seen = [cameras[images[row].position] for row in polished.frames]
-    scale = _scale(polished, images, seen)
-    size = scale.value if scale is not None else seen[0].median_depth / float(points[:, 2].mean())
     first = seen[0].cam_from_world.rotation.matrix()
     origin = points.mean(0)
+    poses = [
+        pycolmap.Rigid3d(pycolmap.Rotation3d(rotation @ first), rotation @ origin + translation)
+        for rotation, translation in zip(state.rotation, state.translation, strict=True)
+    ]  # cam_from_object, in units of the object
+    # `object_from_cam`, perturbed on the right, is seen from the other side.
+    carried = np.array([adjoint(pose.inverse()) for pose in poses])
+    covariance = polished.covariance + smooth_error_covariance(polished, images[0].camera.width)
+    covariance = carried @ covariance @ carried.transpose(0, 2, 1)
+    scale = scale_at_rest(_sighting(poses, covariance, seen)) or _scale(polished, images, seen)
+    size = scale.value if scale is not None else seen[0].median_depth / float(points[:, 2].mean())
+    unit = np.repeat([1.0, size], 3)
     frames = []
-    for k, camera in enumerate(seen):
-        rotation = state.rotation[k] @ first
-        cam_from_object = pycolmap.Rigid3d(
-            pycolmap.Rotation3d(rotation), size * (state.rotation[k] @ origin + state.translation[k])
-        )
-        # `object_from_cam`, perturbed on the right, is seen from the other side.
-        carried = adjoint(cam_from_object.inverse())
-        unit = np.repeat([1.0, size], 3)
-        covariance = carried @ (polished.covariance[k] * np.outer(unit, unit)) @ carried.T
+    for pose, uncertain, camera in zip(poses, covariance, seen, strict=True):
+        cam_from_object = pycolmap.Rigid3d(pose.rotation, size * pose.translation)
         world_from_object = camera.cam_from_world.inverse() * cam_from_object
-        frames.append(ObjectFrame(camera.index, world_from_object, covariance))
+        frames.append(ObjectFrame(camera.index, world_from_object, uncertain * np.outer(unit, unit)))
     return ObjectResult(
         name=name,
         frames=tuple(frames),
@@ -156,17 +158,20 @@ def _result(
         colors=colors[polished.tracks[good]],
         reprojection_error=float(np.median(polished.errors)),
         scale_std=None if scale is None else scale.std,
+        scale_from=None if scale is None else scale.source,
         note=_note(scale),
     )
 
 
-def adjoint(pose: pycolmap.Rigid3d) -> Array:
-    """(6, 6) of a pose, for perturbations (rotation vector, translation)."""
-    rotation = pose.rotation.matrix()
-    adjoint = np.zeros((6, 6))
-    adjoint[:3, :3] = adjoint[3:, 3:] = rotation
-    adjoint[3:, :3] = cross_matrices(pose.translation[None])[0] @ rotation
-    return adjoint
+def _sighting(cam_from_object: Sequence[pycolmap.Rigid3d], covariance: Array, seen: Sequence[SceneCamera]) -> Sighting:
+    world_from_cam = [camera.cam_from_world.inverse() for camera in seen]
+    pairs = list(zip(world_from_cam, cam_from_object, strict=True))
+    return Sighting(
+        np.array([(world.rotation * pose.rotation).matrix() for world, pose in pairs]),
+        np.array([world.translation for world in world_from_cam]),
+        np.array([world.rotation * pose.translation for world, pose in pairs]),
+        covariance,
+    )
 
 
 def _scale(polished: Polished, images: Sequence[ImageTracks], seen: Sequence[SceneCamera]) -> Scale | None:
@@ -189,5 +194,10 @@ def _note(scale: Scale | None) -> str:
         return (
             "Nothing gives its scale: it is put at the scene's median depth, and its size and path are known up to "
             "their distance from the camera."
+        )
+    if scale.source == "rest":
+        return (
+            f"It rests in the scene for {scale.frames} frames, and its scale is that of the scene: "
+            f"± {100 * scale.std:.1g} %."
         )
     return f"Its scale comes from the depth prior on it ({scale.frames} maps): ± {100 * scale.std:.0f} %."

@@ -33,6 +33,7 @@ Index = NDArray[np.int64]
 logger = logging.getLogger(__name__)
 
 LEAST_TRACKS = 20  # of a frame; with fewer, a pose is hardly more than a guess
+LEAST_FRAMES = 5  # that have so many
 _FRAMES, _TRACKS, _LEAST_VIEWS = 10, 150, 3  # of the start: they decide which way the thing turns, no more
 _LEAST_SEEN = 6  # of these tracks in each of these frames: a pose has six variables, and twice as many are seen
 _TURNS_DEG = (20.0, 60.0)  # by which the thing turns in these frames; starts half as far away still arrive

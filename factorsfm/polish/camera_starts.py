@@ -67,10 +67,10 @@ def best_solution(start: State, few: Observations, options: Options) -> CameraSo
             logger.info("%d of %d points do not move in the image and are left out", static.sum(), len(static))
             kept, start, few, best = others, start.of(others), alone.observations, alone
     found = _without_moving(best, options)
-    if _doubtful(found, options):
+    if is_doubtful(found.adjustment, options):
         logger.info("the solution does not fit (%.2f px), trying what turns together", found.adjustment.sigma)
         found = _of_one_group(found, start, few, options)
-    if _doubtful(found, options):
+    if is_doubtful(found.adjustment, options):
         logger.info("the solution does not fit (%.2f px), trying other starts", found.adjustment.sigma)
         for other in (start, flat(start, few, options.polish)):
             found = _better(found, on_what_fits(other, few, options), few)
@@ -80,8 +80,8 @@ def best_solution(start: State, few: Observations, options: Options) -> CameraSo
     return replace(found, kept=kept[found.kept])
 
 
-def _doubtful(found: CameraSolution, options: Options) -> bool:
-    solved = found.adjustment
+def is_doubtful(solved: BundleAdjustment, options: Options) -> bool:
+    """Whether the residuals say that a solution is wrong: they are large, or neighbours have them in common."""
     return solved.sigma > options.polish.doubtful_px or solved.error_inflation() > _DOUBTFUL_INFLATION
 
 

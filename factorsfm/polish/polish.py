@@ -25,12 +25,13 @@ from factorsfm.control.solve import Controlled, frames_under_control, solve_unde
 from factorsfm.control.with_factors import ShotFactors, solve_with_factors
 from factorsfm.lens.rolling_shutter import Recording, seen_at_once
 from factorsfm.mapping.mapped_images import MappedImage
+from factorsfm.motion.stretches import Stretch, stretches
 from factorsfm.polish.connected_frames import connected_frames
 from factorsfm.polish.frames_between import add_frames_between, solved_frames, too_few_tracks
 from factorsfm.polish.observability import camera_observability
 from factorsfm.polish.polished import Polished
 from factorsfm.polish.shot import Shot
-from factorsfm.polish.start import PolishStart, polish_start
+from factorsfm.polish.start import Core, PolishStart, polish_start
 from factorsfm.support.errors import ReconstructionError
 from factorsfm.support.options import Options, PolishOptions
 from factorsfm.support.status import ShotKind
@@ -58,6 +59,8 @@ def polish(
     first_focal: tuple[Array, float] | None = None,
     recording: Recording | None = None,
     suspects: Index | None = None,
+    *,
+    in_time: bool = False,
 ) -> Polished:
     """Triangulate all tracks and minimise over all registered frames.
 
@@ -71,6 +74,7 @@ def polish(
         recording: of which the images are all, if their rows may have been read one after another; None: all at once,
             or in no order of time.
         suspects: ids (ascending) of tracks that count only where they agree with the others.
+        in_time: whether the images were recorded one after another, so that a lens may have zoomed over them.
         control: known poses, points and lengths; it takes part at the end, and only where the camera moves.
         factors: of the caller, where there is no control; they take part as it does.
         joining: gives factors by the poses that images and prior alone show, where there are none before.
@@ -79,7 +83,7 @@ def polish(
         ReconstructionError: hardly any tracks are left that connect frames, or the control does not determine where its
             world is.
     """
-    shot = Shot.of(images, map_points, focal, shape, groups, first_focal, recording, suspects)
+    shot = Shot.of(images, map_points, focal, shape, groups, first_focal, recording, suspects, in_time=in_time)
     named = _named(shot, control, factors, options.polish.max_frames // 2)
     start, frames, left_out = _start(shot, options, named, progress)
     progress("polish: all tracks")
@@ -174,11 +178,21 @@ def _solved(
         frames, adjustment.state, start.tracks, start.observations, adjustment.reprojection_errors(), start.sigma,
         *adjustment.observation_sigmas(), start.core.motion, *_pose_covariances(covariance, adjustment.state),
         camera_observability(adjustment, marginals, covariance), point_std,
-        left_out, prior, start.core.lens, start.core.shutter, moving=start.core.moving, turns=start.core.turns,
-        rest=start.core.rest, rival=start.core.rival, inflation=start.inflation, contradiction=start.depths.correlation,
+        left_out, prior, start.core.lens, start.core.shutter, moving=start.moving, turns=start.core.turns,
+        rest=start.core.rest, rival=start.core.rival, zoom=start.core.zoom,
+        inflation=start.inflation, contradiction=start.depths.correlation,
     )  # fmt: skip
+    if shot.in_time:
+        result.stretches = _stretches(start.core, frames, options)
     result.describe_prior(adjustment, covariance)
     return adjustment, result
+
+
+def _stretches(core: Core, frames: list[int], options: PolishOptions) -> tuple[Stretch, ...]:
+    """What the camera does when, by positions of the images."""
+    found = stretches(core.adjustment, core.motion, options)
+    ends = [frames[s.first] - 1 for s in found[1:]] + [frames[-1]]
+    return tuple(Stretch(frames[s.first], end, s.kind) for s, end in zip(found, ends, strict=True))
 
 
 def _pose_covariances(covariance: Array, state: State) -> tuple[Array, Array]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,9 @@ from factorsfm.lens.lens import LensEstimate
 from factorsfm.lens.rolling_shutter import Shutter
 from factorsfm.motion.at_rest import Rest
 from factorsfm.motion.shot_kind import Motion
+from factorsfm.motion.stretches import Stretch
 from factorsfm.polish.observability import CameraObservability
+from factorsfm.support.semidefinite import deviations
 from factorsfm.support.similarity import Similarity
 
 Array = NDArray[np.float64]
@@ -43,11 +45,13 @@ class Polished:
             where such a camera would have it (pixels), None where they are not.
         shutter_error: median reprojection error with the rolling shutter in the model (pixels); NaN where poses are not
             `recorded`.
-        moving: share of the longest tracks that move by themselves and are left out.
+        moving: ids (ascending) of the tracks that move by themselves and are left out.
         turns: whether a camera that only turns explains the tracks through a lens of its own, see `turning_reading`.
         rest: what rests in the image while other things move, None where nothing does.
         rival: cost of this reading of the shot over that of the next best one in which something else is the scene; 0
             where nothing else may be.
+        stretches: by positions of the images, in order of time; empty where they are in no order.
+        zoom: longest over shortest focal length of a zoom that the tracks ask for and that is not estimated; 0: none.
         inflation: of the variance of the core tracks, since errors of neighbours are alike, see `error_inflation`.
         contradiction: see `NearAndFar.correlation`.
         world_alignment: from this world to that of the control; control: its residuals. None without control.
@@ -75,10 +79,12 @@ class Polished:
     recorded: bool = False
     rolled: Array | None = None
     shutter_error: float = np.nan
-    moving: float = 0.0
+    moving: Index = field(default_factory=lambda: np.zeros(0, np.int64))
     turns: bool = False
     rest: Rest | None = None
     rival: float = 0.0
+    zoom: float = 0.0
+    stretches: tuple[Stretch, ...] = ()
     inflation: float = 1.0
     contradiction: float | None = None
     world_alignment: Similarity | None = None
@@ -94,6 +100,6 @@ class Polished:
         """
         if self.prior is None:
             return
-        std = np.sqrt(camera_covariance.diagonal())
+        std = deviations(camera_covariance)
         self.prior.residual, self.prior.residual_sigma = adjustment.prior_residuals()
         self.prior.scale_std, self.prior.shift_std = std[adjustment.columns.scales], std[adjustment.columns.shifts]

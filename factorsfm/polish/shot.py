@@ -32,6 +32,7 @@ class Shot:
         first_focal: see `estimate_lens`.
         recording: of which the images are all, None if their rows were all read at once.
         suspects: ids (ascending) of the tracks that take part only where they agree with the others.
+        in_time: whether the images were recorded one after another.
     """
 
     images: list[MappedImage]
@@ -41,6 +42,7 @@ class Shot:
     first_focal: tuple[Array, float] | None
     recording: Recording | None
     suspects: Index
+    in_time: bool
 
     @classmethod
     def of(
@@ -53,6 +55,8 @@ class Shot:
         first_focal: tuple[Array, float] | None,
         recording: Recording | None,
         suspects: Index | None,
+        *,
+        in_time: bool,
     ) -> Shot:
         """A shot whose lens is estimated where a distortion is given: its tracks keep their distorted pixels then."""
         guess = Lens(focal)
@@ -61,7 +65,7 @@ class Shot:
             images = [replace(image, tracks=_distorted(image.tracks)) for image in images]
         group = np.zeros(len(images), np.int64) if groups is None else groups
         suspects = np.zeros(0, np.int64) if suspects is None else suspects
-        return cls(images, map_points, guess, group, first_focal, recording, suspects)
+        return cls(images, map_points, guess, group, first_focal, recording, suspects, in_time)
 
     @property
     def registered(self) -> list[int]:

@@ -17,14 +17,14 @@ from factorsfm.lens.estimate import estimate_lens
 from factorsfm.lens.lens import LensEstimate, observed_width, shape_sigmas, through
 from factorsfm.lens.rolling_shutter import Shutter, find_shutter
 from factorsfm.lens.search import FoundLens, found_lens
-from factorsfm.lens.zoom import find_zoom
+from factorsfm.lens.zoom import Zoom, find_zoom, unannounced_zoom
 from factorsfm.mapping.all_points import triangulated, with_all_points
 from factorsfm.motion.at_rest import Rest
-from factorsfm.motion.moving import center_and_spread, log_errors
+from factorsfm.motion.moving import center_and_spread, log_errors, moving_together
 from factorsfm.motion.readings import solution_from
 from factorsfm.motion.shot_kind import Motion, classify_motion
 from factorsfm.motion.suspects import agreeing
-from factorsfm.polish.camera_starts import best_solution, core_tracks, on_what_fits
+from factorsfm.polish.camera_starts import best_solution, core_tracks, is_doubtful, on_what_fits
 from factorsfm.polish.near_and_far import NearAndFar, near_and_far
 from factorsfm.polish.shot import Shot
 from factorsfm.polish.simple_readings import turning_reading, unless_at_rest
@@ -35,7 +35,6 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 _MANY_TRACKS = 0.3  # of the largest number of tracks in a frame
-_MOSTLY_MOVING = 0.4  # of the core: a median of all points would say nothing of the others
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +45,7 @@ class PolishStart:
         state: of cameras, lens and points; observations, tracks: that belong together.
         sigma: of the core tracks, pixels; inflation: of its square, since errors repeat themselves.
         depths: with the prior at the weight it earns; core: solved first.
+        moving: see `Polished`.
     """
 
     state: State
@@ -55,6 +55,7 @@ class PolishStart:
     inflation: float
     depths: NearAndFar
     core: Core
+    moving: Index
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,18 +64,20 @@ class Core:
 
     Attributes:
         points: rows of the core among all points; adjustment: converged over them.
-        moving, turns, rest, rival: see `Polished`.
+        left_out: rows of the points without which it is.
+        turns, rest, rival, zoom: see `Polished`.
     """
 
     points: Index
+    left_out: Index
     adjustment: BundleAdjustment
     motion: Motion
     lens: LensEstimate | None
     shutter: Shutter | None
-    moving: float
     turns: bool
     rest: Rest | None
     rival: float
+    zoom: float
 
 
 def polish_start(
@@ -100,8 +103,10 @@ def polish_start(
 
     progress("polish: points")
     part = core.adjustment.state if general else core.motion.rotation_only
-    fitting = _with_fitting_tracks(part, core, observations, tracks, shot.suspects, options.polish)
-    return PolishStart(*fitting, core.adjustment.sigma, inflation, depths, core)
+    state, observations, tracks, moving = _with_fitting_tracks(
+        part, core, observations, tracks, shot.suspects, options.polish
+    )
+    return PolishStart(state, observations, tracks, core.adjustment.sigma, inflation, depths, core, moving)
 
 
 def _solved_core(shot: Shot, frames: list[int], observations: Observations, tracks: Index, options: Options) -> Core:
@@ -118,19 +123,24 @@ def _solved_core(shot: Shot, frames: list[int], observations: Observations, trac
             guess = through(guess, search.straight.focal) if search.clear else guess
         found = unless_at_rest(best_solution(guess, few, options), guess, few, options)
     adjustment, few = found.adjustment, found.adjustment.observations
-    motion, lens, shutter = None, None, None
+    motion, lens, shutter, zoom = None, None, None, None
     if few.sweep is not None:
         motion = _motion(adjustment, found.rest, o)
         shutter = find_shutter(adjustment, motion, options)
     if shutter is not None:
         adjustment = solution_from(replace(adjustment.state, lens=shutter.lens.shape), few, options.polish)
     if options.estimates_lens:
-        adjustment, lens = _estimate_lens(adjustment, shot, frames, options, search, moves=not found.turns)
+        adjustment, lens, zoom = _estimate_lens(adjustment, shot, frames, options, search, moves=not found.turns)
         shutter = shutter and shutter.known_with(lens)
+    elif shot.in_time and is_doubtful(adjustment, options):
+        zoom = unannounced_zoom(adjustment, adjustment, shot.times(frames), options.polish, doubtful=True)
     if motion is None or lens is not None or shutter is not None:
         motion = _motion(adjustment, found.rest, o)
-    moving = found.moving / len(core)
-    return Core(core[found.kept], adjustment, motion, lens, shutter, moving, found.turns, found.rest, found.rival)
+    kept, left_out = core[found.kept], np.delete(core, found.kept)
+    suspected = 0.0 if zoom is None else zoom.ratio
+    return Core(
+        kept, left_out, adjustment, motion, lens, shutter, found.turns, found.rest, found.rival, suspected
+    )  # fmt: skip
 
 
 def _motion(adjustment: BundleAdjustment, rest: Rest | None, options: PolishOptions) -> Motion:
@@ -173,7 +183,7 @@ def _world(observations: Observations) -> int:
 
 def _searched(guess: State, observations: Observations, options: Options) -> FoundLens:
     """The lenses that few frames show, without what moves by itself there."""
-    solved = on_what_fits(*some_frames(guess, observations), options).adjustment
+    solved = on_what_fits(*some_frames(guess, observations)[1:], options).adjustment
     width = observed_width(solved.state, solved.observations)
     return found_lens(solved, options.polish, np.r_[shape_sigmas(options.lens, width), np.zeros(2)])
 
@@ -186,18 +196,24 @@ def _estimate_lens(
     search: FoundLens | None,
     *,
     moves: bool,
-) -> tuple[BundleAdjustment, LensEstimate]:
-    """As `estimate_lens`, with a focal length for every frame where a zoom is asked for and found."""
-    zoom = None
+) -> tuple[BundleAdjustment, LensEstimate, Zoom | None]:
+    """As `estimate_lens`, with a focal length for every frame where there is a zoom; and one that is only suspected."""
+    zoom, suspected, times = None, None, shot.times(frames)
     if options.lens == "zoom" and len(adjustment.state.log_focal) == 1:
-        zoom = find_zoom(adjustment, shot.times(frames), options.polish)
+        zoom = find_zoom(adjustment, times, options.polish)
     if zoom is None or not zoom.found:
         first = shot.first_focal or (shot.guess.focal, 0.0)
-        adjustment, lens = estimate_lens(adjustment, options, first_focal=first, search=search, moves=moves)
-        return adjustment, replace(lens, zoom_std=zoom.std if zoom else None)
+        fixed, lens = estimate_lens(adjustment, options, first_focal=first, search=search, moves=moves)
+        if options.lens == "distortion" and shot.in_time and len(adjustment.state.log_focal) == 1:
+            doubtful = is_doubtful(fixed, options)
+            if moves or doubtful:
+                suspected = unannounced_zoom(adjustment, fixed, times, options.polish, doubtful=doubtful)
+        if suspected is None or not suspected.certain:
+            return fixed, replace(lens, zoom_std=zoom.std if zoom else None), suspected
+        zoom = suspected
     prior = FocalPrior(np.zeros(len(frames)), zoom.information)
     adjustment, lens = estimate_lens(zoom.adjustment, options, prior)
-    return adjustment, replace(lens, zoom_std=zoom.std)
+    return adjustment, replace(lens, zoom_std=zoom.std, announced=suspected is None), None
 
 
 # --- all tracks -------------------------------------------------------------------------------------------------
@@ -205,37 +221,41 @@ def _estimate_lens(
 
 def _with_fitting_tracks(
     part: State, core: Core, observations: Observations, tracks: Index, suspects: Index, options: PolishOptions
-) -> tuple[State, Observations, Index]:
-    """All points for the cameras of `part`, and the tracks that fit them; of the suspects those that agree."""
-    solved, points = core.adjustment, core.points
+) -> tuple[State, Observations, Index, Index]:
+    """All points for the cameras of `part`, and the tracks that fit them; of the suspects those that agree.
+
+    The last of the result are the tracks that move by themselves.
+    """
+    solved, points, left_out = core.adjustment, core.points, core.left_out
     with_ray = np.asarray(np.isfinite(solved.state.normalized(observations)).all(axis=1))
     if not with_ray.all():
         observations, kept = _only(observations, with_ray)
         tracks, points = tracks[kept], np.searchsorted(kept, points)
+        left_out = np.flatnonzero(np.isin(kept, left_out))
     state = with_all_points(part, solved.state, observations, points)
     adjustment = BundleAdjustment(
         state, observations, replace(options, iterations=4), solved.errors, free=Free(cameras=False)
     )
     state, errors = adjustment.solve(), adjustment.reprojection_errors()
     agree = agreeing(observations, errors, np.isin(tracks, suspects))
-    if not agree.all():
-        kept = np.flatnonzero(agree)
-        state, tracks, errors = state.of(kept), tracks[kept], errors[agree[observations.point]]
-        points = np.searchsorted(kept, points)  # of the core, which has no suspects
+    left_out = np.union1d(left_out, np.flatnonzero(~agree))
+    moves = moving_together(observations, errors, solved.sigma, rests_on=points, left_out=left_out)
+    scene, moving = agree & ~moves, tracks[moves]
+    if not scene.all():
+        kept = np.flatnonzero(scene)
+        state, tracks, errors = state.of(kept), tracks[kept], errors[scene[observations.point]]
         observations = observations.of(kept)
     if options.observation_sigmas is None:
-        # Where most of the core is left out, what moves by itself is what is usual.
-        usual = points if core.moving > _MOSTLY_MOVING else np.arange(len(tracks))
-        kept = _usual_points(observations, errors, usual, options)
-        return state.of(kept), observations.of(kept), tracks[kept]
+        kept = _usual_points(observations, errors, options)
+        return state.of(kept), observations.of(kept), tracks[kept], moving
     observations, kept = _only(observations, errors < options.observation_sigmas * solved.sigma)
-    return state.of(kept), observations, tracks[kept]
+    return state.of(kept), observations, tracks[kept], moving
 
 
-def _usual_points(observations: Observations, errors: Array, usual: Index, options: PolishOptions) -> Index:
-    """Points whose typical error is not far outside that of the usual ones (log scale, robust)."""
+def _usual_points(observations: Observations, errors: Array, options: PolishOptions) -> Index:
+    """Points whose typical error is not far outside the usual (log scale, robust)."""
     typical = log_errors(observations, errors)
-    center, spread = center_and_spread(typical[usual])
+    center, spread = center_and_spread(typical)
     return np.nonzero(typical < center + options.outlier_sigmas * max(spread, 0.1))[0]
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.support.semidefinite import solution
+
 Array = NDArray[np.float64]
 
 # Standard deviations of the affine of an image in a joint solve.
@@ -39,14 +41,14 @@ def fit_affine(inverse_depth: Array, measured: Array, *, free_shift: bool = True
     first = np.array([typical / center, 0.0])
     shift_sigma = (_FIT_SHIFT_SIGMA if free_shift else KNOWN_SHIFT_SIGMA) * max(typical, 1e-9)
     prior = np.diag([first[0] ** -2.0, shift_sigma**-2.0])
-    solution = first
+    found = first
     sigma = 1.0
     for _ in range(_ITERATIONS):
-        residual = design @ solution - measured
+        residual = design @ found - measured
         sigma = max(1.4826 * float(np.median(np.abs(residual))), 1e-6)
         weight = 1.0 / (1.0 + (residual / (_KERNEL * sigma)) ** 2)
         normal = design.T @ (design * weight[:, None]) / sigma**2
-        solution = np.linalg.solve(normal + prior, design.T @ (weight * measured) / sigma**2 + prior @ first)
-    if solution[0] < _LEAST_SCALE * first[0]:
-        solution = np.array([_LEAST_SCALE * first[0], typical - _LEAST_SCALE * typical])
-    return float(solution[0]), float(solution[1]), sigma
+        found = solution(normal + prior, design.T @ (weight * measured) / sigma**2 + prior @ first)
+    if found[0] < _LEAST_SCALE * first[0]:
+        found = np.array([_LEAST_SCALE * first[0], typical - _LEAST_SCALE * typical])
+    return float(found[0]), float(found[1]), sigma

@@ -14,6 +14,7 @@ from factorsfm.priors.frame_folder import FrameFolder, check_aspect
 from factorsfm.support.errors import InputError
 
 _SUFFIXES = (".png", ".bmp", ".tif", ".tiff")
+FROM_MOTION = "auto"  # in place of masks: whatever moves by itself
 _MOST_OBJECTS = 50  # in one mask; more values are those of a smoothed outline
 
 

@@ -55,6 +55,12 @@ const tracks = hasTracks ? {
   residual: typed(data.tracks.residual, Int16Array),
   prior: typed(data.tracks.prior, Int16Array),
 } : null;
+// What moves by itself, by frame as the tracks; null where nothing does.
+const moving = data.moving ? {
+  start: data.moving.start,
+  track: typed(data.moving.track, Uint32Array),
+  place: typed(data.moving.place, Uint16Array),
+} : null;
 const NONE = -32768;
 
 const sortedDepths = points.filter((_, i) => i % 3 === 2).sort();

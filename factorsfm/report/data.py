@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 from factorsfm.report.charts import charts
 from factorsfm.report.geometry import Tracks, median_prior_residuals, scene, tracks
 from factorsfm.report.wording import status_words
+from factorsfm.result.moving import Moving
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
 
 _MAX_POINTS = 20_000
 _MAX_OBSERVATIONS = 150_000
+_MAX_MOVING = 50_000
 _RESIDUAL_STEPS = 256  # per pixel
 _PRIOR_STEPS = 10_000  # per 100 %
 _NONE = -(2**15)
@@ -42,6 +44,7 @@ def reconstruction_data(reconstruction: Reconstruction) -> dict[str, Any]:
             tracks(reconstruction, view, _MAX_OBSERVATIONS),
             [reconstruction.camera_of(f) for f in reconstruction.frames],
         ),
+        "moving": None if reconstruction.moving is None else _moving_data(reconstruction.moving, reconstruction),
     }
 
 
@@ -71,12 +74,32 @@ def _tracks_data(found: Tracks, cameras: Sequence[pycolmap.Camera]) -> dict[str,
     return {
         "start": np.searchsorted(found.position, np.arange(len(cameras) + 1)),
         "point": _base64(found.point, "<u2"),
-        "place": _base64(np.clip(np.round(65535 * place), 0, 65535), "<u2"),
+        "place": _base64(_fractions(place), "<u2"),
         "residual": _base64(_steps(found.residual, _RESIDUAL_STEPS), "<i2"),
         "residual_steps": _RESIDUAL_STEPS,
         "prior": _base64(_steps(found.prior_residual, _PRIOR_STEPS), "<i2"),
         "prior_steps": _PRIOR_STEPS,
     }
+
+
+def _moving_data(moving: Moving, reconstruction: Reconstruction) -> dict[str, Any]:
+    """Tracks that move by themselves, an even choice of them where there are too many, and the stretches."""
+    kept = moving.track % max(1, -(-len(moving.frame) // _MAX_MOVING)) == 0
+    index = np.array([frame.index for frame in reconstruction.frames])
+    position = np.searchsorted(index, moving.frame[kept])
+    sizes = np.array([(camera.width, camera.height) for camera in map(reconstruction.camera_of, reconstruction.frames)])
+    place = (moving.xy[kept] + 0.5) / sizes[position]
+    return {
+        "start": np.searchsorted(position, np.arange(len(index) + 1)),
+        "track": _base64(moving.track[kept], "<u4"),
+        "place": _base64(_fractions(place), "<u2"),
+        "stretches": [(stretch.first, stretch.last) for stretch in moving.stretches],
+    }
+
+
+def _fractions(place: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Places between 0 and 1 as 16-bit steps."""
+    return np.clip(np.round(65535 * place), 0, 65535)
 
 
 def _steps(values: NDArray[np.float64], per_unit: int) -> NDArray[np.float64]:

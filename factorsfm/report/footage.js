@@ -38,28 +38,40 @@ const worstError = Math.max(2 * quantile(sortedErrors, 0.9), 0.05);
 // Typical residuals are to appear about 1 % of the width long.
 const magnified = hasTracks ? clamp(roundLength(0.01 * data.width / Math.max(quantile(sortedErrors, 0.5), 1e-3)), 1, 200) : 1;
 
+// The way of the tracks of a frame through those before it.
+function drawTails({context, width, height, ratio}, position, start, track, place, color) {
+  const x = o => place[2 * o] / 65535 * width, y = o => place[2 * o + 1] / 65535 * height;
+  const before = new Map(), shown = new Set(track.subarray(start[position], start[position + 1]));
+  context.beginPath();
+  for (let k = Math.max(0, position - TAIL); k <= position; k++) {
+    for (let o = start[k]; o < start[k + 1]; o++) {
+      const from = before.get(track[o]);
+      if (shown.has(track[o]) && from !== undefined) { context.moveTo(x(from), y(from)); context.lineTo(x(o), y(o)); }
+      before.set(track[o], o);
+    }
+  }
+  context.strokeStyle = color;
+  context.lineWidth = ratio;
+  context.stroke();
+}
+
+function drawMoving(prepared, position) {
+  const {context, width, height, ratio} = prepared, side = 4 * ratio;
+  drawTails(prepared, position, moving.start, moving.track, moving.place, css("--moving"));
+  context.fillStyle = css("--moving");
+  for (let o = moving.start[position]; o < moving.start[position + 1]; o++)
+    context.fillRect(moving.place[2 * o] / 65535 * width - side / 2, moving.place[2 * o + 1] / 65535 * height - side / 2, side, side);
+}
+
 function drawFootage() {
   const prepared = prepare(byId("footage"));
   if (!prepared) return;
   const {context, width, height, ratio} = prepared, position = seek.position;
   drawPicture(prepared, position, 1);
+  if (moving && byId("show_moving").checked) drawMoving(prepared, position);
   if (!hasTracks) return;
   const x = o => tracks.place[2 * o] / 65535 * width, y = o => tracks.place[2 * o + 1] / 65535 * height;
-  if (byId("show_tracks").checked) {
-    const before = new Int32Array(pointCount).fill(-1), shown = new Uint8Array(pointCount);
-    for (let o = tracks.start[position]; o < tracks.start[position + 1]; o++) shown[tracks.point[o]] = 1;
-    context.beginPath();
-    for (let k = Math.max(0, position - TAIL); k <= position; k++) {
-      for (let o = tracks.start[k]; o < tracks.start[k + 1]; o++) {
-        const point = tracks.point[o], from = before[point];
-        if (shown[point] && from >= 0) { context.moveTo(x(from), y(from)); context.lineTo(x(o), y(o)); }
-        before[point] = o;
-      }
-    }
-    context.strokeStyle = "#ffffffb0";
-    context.lineWidth = ratio;
-    context.stroke();
-  }
+  if (byId("show_tracks").checked) drawTails(prepared, position, tracks.start, tracks.point, tracks.place, "#ffffffb0");
   const pixel = magnified * width / data.width / data.tracks.residual_steps, side = 3 * ratio;
   for (let o = tracks.start[position]; o < tracks.start[position + 1]; o++) {
     const error = errorOf(o);
@@ -170,6 +182,11 @@ function drawStrip() {
     context.fillRect(k * step, tall, Math.max(step, 1), bar);
   }
   context.globalAlpha = 1;
+  context.fillStyle = css("--moving");
+  for (const [first, last] of moving ? data.moving.stretches : []) {
+    const begin = data.frame.indexOf(first), end = data.frame.indexOf(last);
+    context.fillRect(begin * step, tall - bar / 2, (end + 1 - begin) * step, bar / 2);
+  }
   for (const [color, wide] of [["#000", 4], ["#fff", 2]]) {
     context.fillStyle = color;
     context.fillRect((seek.position + 0.5) * step - wide * ratio / 2, 0, wide * ratio, height);
@@ -184,7 +201,7 @@ function startFootage() {
   const aspect = data.width ? `${data.width} / ${data.height}` : "16 / 9";
   for (const id of ["footage", "solved_depth", "prior_depth", "depth_scatter"]) byId(id).style.aspectRatio = aspect;
   byId("residuals_label").textContent = `residuals, ${magnified} times longer`;
-  for (const id of ["show_tracks", "show_residuals"]) byId(id).addEventListener("change", drawFootageLater);
+  for (const id of ["show_tracks", "show_residuals", "show_moving"]) byId(id).addEventListener("change", drawFootageLater);
   const strip = byId("strip");
   if (!hasThumbnails) strip.style.height = "14px";
   const seekTo = event => { if (event.buttons) goTo(Math.floor(event.offsetX / strip.clientWidth * frameCount)); };

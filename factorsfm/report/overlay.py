@@ -1,4 +1,4 @@
-"""The overlay: the footage with tracked points, a grid and cubes locked into the scene, as a video."""
+"""The overlay: the footage with its tracks, and a grid and cubes locked into the scene, as a video."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from factorsfm.camera.projection import PIXEL_CENTER
 from factorsfm.export.options import ExportOptions
-from factorsfm.export.shot import Defaults, Shot, make_shot
+from factorsfm.export.shot import Defaults, Lens, Shot, make_shot
 from factorsfm.export.writing import complete_file
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.reading import read_frames
@@ -28,14 +28,16 @@ Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 CODECS = {".mp4": "mp4v", ".mov": "mp4v", ".avi": "MJPG"}
-LAYERS = ("grid", "cubes", "points")
+LAYERS = ("grid", "cubes", "points", "moving")
 
 _SUBPIXEL = 4  # fractional bits of OpenCV's drawing coordinates
 _GRID, _EDGE = (255, 200, 90), (30, 30, 30)
 _CUBES = ((60, 150, 250), (190, 110, 220), (110, 190, 90))
 _GOOD, _POOR, _LOST = np.array([90, 220, 60.0]), np.array([40, 40, 255.0]), (60, 60, 255)
+_MOVING = (255, 40, 255)
 _POOR_PX = 1.0  # reprojection error of a point that is drawn in red
 _FACES = np.array([[0, 1, 2, 3], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])
+_UPRIGHT, _DIAGONAL = np.eye(2), np.array([[0.7, 0.7], [0.7, -0.7]])  # ends of the arms of a cross
 _SIDE = np.linspace(0, 1, 9)[:-1, None]  # a side of a face is drawn in parts, since a lens bends it
 _MARGIN = 1.3  # times the image's field of view: beyond it lens models go astray
 
@@ -93,10 +95,10 @@ def write_overlay(
     """Write the footage with what is locked into the scene drawn over it, one picture a frame of the reconstruction.
 
     Args:
-        path: .mp4, .mov or .avi (JPEG pictures: larger and better). An odd width or height gains a pixel, since the
-            codecs need even ones.
+        path: .mp4, .mov or .avi (JPEG pictures: larger and better). Its pixels are square: squeezed footage is
+            stretched. An odd width or height gains a pixel, since the codecs need even ones.
         source: the shot, as `ExportOptions.footage`; None takes the source of the reconstruction.
-        hide: of "grid", "cubes", "points".
+        hide: of "grid", "cubes", "points", "moving".
         progress: called with the stage, the frames done, and their number.
 
     Returns:
@@ -117,11 +119,12 @@ def write_overlay(
         raise InputError("the source of this result is not where it was; say where the shot is")
     reconstruction = shot.reconstruction  # in its own world, at the size of the footage
     props, projector = place_props(reconstruction), Projector.of(reconstruction)
-    camera, frames = reconstruction.camera, reconstruction.frames
+    frames = reconstruction.frames
     step = np.median(np.diff([frame.index for frame in frames])) if len(frames) > 1 else 1
     layers = [layer for layer in LAYERS if layer not in hide]
     with complete_file(path) as file:
-        even = camera.width + camera.width % 2, camera.height + camera.height % 2
+        shown = _unsqueezed(shot.lens)
+        even = shown[0] + shown[0] % 2, shown[1] + shown[1] % 2
         video = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*CODECS[path.suffix.lower()]), shot.fps / step, even)
         if not video.isOpened():
             raise InputError(f"OpenCV cannot write the video {path}")
@@ -130,13 +133,22 @@ def write_overlay(
                 if progress is not None:
                     progress("overlay", position, len(frames))
                 image = draw_overlay(reconstruction, position, frame.image, props, projector, layers)
-                right, below = even[0] - camera.width, even[1] - camera.height
+                image = (
+                    image if shown == image.shape[1::-1] else cv2.resize(image, shown, interpolation=cv2.INTER_CUBIC)
+                )
+                right, below = even[0] - shown[0], even[1] - shown[1]
                 video.write(cv2.copyMakeBorder(image, 0, below, 0, right, cv2.BORDER_REPLICATE))
         finally:
             video.release()
         if (kept := count_frames(file)) < len(frames):  # OpenCV says nothing of a full disk
             raise OSError(f"only {kept} of {len(frames)} frames are in the file; is the disk full?")
     return props
+
+
+def _unsqueezed(lens: Lens) -> tuple[int, int]:
+    """Width and height of the picture in square pixels: no line or column is lost."""
+    aspect = lens.nominal_aspect
+    return round(lens.width * max(aspect, 1.0)), round(lens.height * max(1.0 / aspect, 1.0))
 
 
 def draw_overlay(
@@ -164,6 +176,9 @@ def draw_overlay(
         if "points" in layers:
             mine = reconstruction.observation_frame == position
             _draw_points(canvas, reconstruction.observation_xy[mine], reconstruction.observation_error[mine])
+    if (moving := reconstruction.moving) is not None and "moving" in layers:
+        _draw_crosses(canvas, moving.xy[moving.frame == frame.index], _MOVING, _DIAGONAL)
+        _draw_legend(canvas)
     _label(canvas, frame)
     return canvas
 
@@ -212,21 +227,42 @@ def _draw_cubes(canvas: Image, props: Props, pose: pycolmap.Rigid3d, projector: 
 
 def _draw_points(canvas: Image, xy: Array, error: Array) -> None:
     """A cross where each point is tracked: green where the solve agrees, red where it misses it by a pixel."""
-    arm = 2.0 + canvas.shape[1] / 800
     share = np.clip(np.nan_to_num(error, nan=_POOR_PX) / _POOR_PX, 0, 1)[:, None]
-    for (x, y), color in zip(xy, (_GOOD + share * (_POOR - _GOOD)).tolist(), strict=True):
-        for ends in ([[x - arm, y], [x + arm, y]], [[x, y - arm], [x, y + arm]]):
-            cv2.polylines(canvas, [_fixed(np.array(ends))], False, color, 1, cv2.LINE_AA, _SUBPIXEL)
+    for place, color in zip(xy, (_GOOD + share * (_POOR - _GOOD)).tolist(), strict=True):
+        _draw_crosses(canvas, place[None], color, _UPRIGHT)
+
+
+def _draw_crosses(canvas: Image, xy: Array, color: Sequence[float], arms: Array) -> None:
+    """A cross at each place (n, 2), of two arms (2, 2) that are given for one of them by its end."""
+    size = 2.0 + canvas.shape[1] / 800
+    for arm in size * arms:
+        lines = _fixed(xy[:, None] + [-arm, arm])
+        cv2.polylines(canvas, list(lines), False, color, 1, cv2.LINE_AA, _SUBPIXEL)
+
+
+def _draw_legend(canvas: Image) -> None:
+    """Which crosses are which, in the lower left corner."""
+    size = canvas.shape[1] / 1600 + 0.2
+    step, left = round(30 * size), 14
+    for line, (text, color, arms) in enumerate(
+        (("moves by itself", _MOVING, _DIAGONAL), ("tracked in the scene", _GOOD.tolist(), _UPRIGHT))
+    ):
+        y = canvas.shape[0] - 14 - step * line
+        _draw_crosses(canvas, np.array([[left, y - 8 * size]]), color, arms)
+        _write(canvas, text, (round(left + 18 * size), y), size, color)
 
 
 def _label(canvas: Image, frame: FrameResult) -> None:
     size = canvas.shape[1] / 1600 + 0.2
     color = (255, 255, 255) if frame.registered else _LOST
     text = f"{frame.index}" if frame.registered else f"{frame.index}: {status_words(frame.status)}"
+    _write(canvas, text, (10, round(12 + 24 * size)), size, color)
+
+
+def _write(canvas: Image, text: str, at: tuple[int, int], size: float, color: Sequence[float]) -> None:
+    """A text with a dark rim, from its lower left corner on."""
     for ink, thickness in (((0, 0, 0), 3), (color, 1)):
-        cv2.putText(
-            canvas, text, (10, round(12 + 24 * size)), cv2.FONT_HERSHEY_SIMPLEX, size, ink, thickness, cv2.LINE_AA
-        )
+        cv2.putText(canvas, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, ink, thickness, cv2.LINE_AA)
 
 
 def _visible(line: Array) -> list[Array]:

@@ -30,6 +30,7 @@ function drawAll() {
 byId("scene_card").hidden = byId("scene_hint").hidden = !solved;
 byId("footage_card").hidden = !hasThumbnails && !hasTracks;
 byId("tracks_controls").hidden = !hasTracks;
+byId("moving_control").hidden = !moving;
 if (!solved) byId("footage_title").textContent = "Footage";
 byId("depth_section").hidden = withPrior.every(position => position < 0);
 byId("charts_section").hidden = !charts.length;

@@ -100,11 +100,31 @@ def _facts(reconstruction: Reconstruction) -> dict[str, Any]:
         "Points": f"{len(reconstruction.points):,}",
         "Observations": f"{len(reconstruction.observation_point):,}",
         "Parallax": f"{reconstruction.parallax:.3f}",
-        "Motion": reconstruction.kind,
+        "Motion": _motion(reconstruction),
         "Scale": "metres" if reconstruction.metric else "free",
         "Focal length": f"{focals[0]:.1f} to {focals[1]:.1f} px" if focals else f"{camera.mean_focal_length():.1f} px",
         "Lens": f"{camera.model_name} {camera.width}×{camera.height}",
-    } | _object_facts(reconstruction)
+        **_moving_facts(reconstruction),
+        **_object_facts(reconstruction),
+    }
+
+
+def _moving_facts(reconstruction: Reconstruction) -> dict[str, Any]:
+    """A line on what moves by itself, where something does."""
+    moving = reconstruction.moving
+    return (
+        {"Moves by itself": f"up to {100 * max(s.image for s in moving.stretches):.0f} % of the image"}
+        if moving
+        else {}
+    )
+
+
+def _motion(reconstruction: Reconstruction) -> str:
+    """The kind of motion, and that of each stretch where they differ."""
+    stretches = reconstruction.stretches
+    if len(stretches) < 2:
+        return reconstruction.kind
+    return ", ".join(f"{s.kind} ({s.first}–{s.last})" for s in stretches)
 
 
 def _object_facts(reconstruction: Reconstruction) -> dict[str, Any]:

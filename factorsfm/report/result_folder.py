@@ -15,6 +15,7 @@ from factorsfm.export.ply import write_ply
 from factorsfm.export.trajectory import write_trajectory
 from factorsfm.export.writing import exchanged, rename_all
 from factorsfm.report.page import failure_html, report_html
+from factorsfm.result.moving import moving_json
 from factorsfm.result.objects import objects_json
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.result.summary import failure_summary, incomplete_summary, part_name, summary
@@ -24,14 +25,15 @@ from factorsfm.support.json_text import json_text
 from factorsfm.support.program import PROGRAM
 
 # Whatever an earlier result may have left besides summary.json; picture.png is drawn by the demo.
-_ENTRIES = ("trajectory.tum", "colmap", "points.ply", "objects.json", "report.html", "picture.png")
+_ENTRIES = ("trajectory.tum", "colmap", "points.ply", "objects.json", "moving.json", "report.html", "picture.png")
 _SUMMARY = "summary.json"
 _PARTS = "part-[0-9][0-9][0-9]*"  # folders of the other parts of an image set
 _REPLACING = f".{PROGRAM}-replacing-"  # begins the name of the folder in which a result waits that replaces another
 
 
 def write_folder(reconstruction: Reconstruction, directory: str | Path) -> None:
-    """Write trajectory.tum, colmap/, points.ply, summary.json, report.html, and objects.json where there are objects.
+    """Write trajectory.tum, colmap/, points.ply, summary.json, report.html; objects.json where there are objects, and
+    moving.json where something moves by itself.
 
     All of them or nothing.
 
@@ -56,6 +58,9 @@ def _write_files(reconstruction: Reconstruction, folder: Path) -> None:
     if reconstruction.objects:
         content = json_text(objects_json(reconstruction.objects), indent=None)
         (folder / "objects.json").write_text(content, encoding="utf-8")
+    if reconstruction.moving is not None:
+        content = json_text(moving_json(reconstruction.moving), indent=None)
+        (folder / "moving.json").write_text(content, encoding="utf-8")
     (folder / "report.html").write_text(report_html(reconstruction), encoding="utf-8")
     (folder / _SUMMARY).write_text(json_text(summary(reconstruction)), encoding="utf-8")
 

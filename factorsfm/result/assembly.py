@@ -16,9 +16,11 @@ from factorsfm.lens.camera_model import with_distortion
 from factorsfm.lens.lens import LensEstimate
 from factorsfm.lens.rolling_shutter import Shutter
 from factorsfm.mapping.mapped_images import MappedImage
+from factorsfm.motion.stretches import Stretch
 from factorsfm.polish.polished import Polished
 from factorsfm.priors.depth_map import DepthKind
 from factorsfm.result.frame_results import SourceFrame, frame_results
+from factorsfm.result.moving import Moving, moving_in
 from factorsfm.result.notes import result_doubts, result_notes
 from factorsfm.result.reconstruction import LensFit, ObservationNoise, Reconstruction, RollingShutter
 from factorsfm.support.parallax import parallax
@@ -73,6 +75,7 @@ def assemble(
         observation_error=observations.error,
         prior_residual=observations.prior_residual,
         kind=polished.motion.kind,
+        stretches=tuple(Stretch(frames[s.first].index, frames[s.last].index, s.kind) for s in polished.stretches),
         parallax=parallax(camera_centers(state.rotation, state.translation), state.inverse_distance),
         point_std=polished.point_std[kept] / state.inverse_distance[kept] if general else None,
         noise=observations.noise,
@@ -86,6 +89,7 @@ def assemble(
         seconds=seconds,
         options=options,
     )
+    result.moving = _moving(polished, images, frames)
     has_depth = any(image.tracks.depth is not None for image in images)
     guessed = camera if polished.lens is None and not lens_given else None
     result.doubts += result_doubts(polished)
@@ -95,6 +99,16 @@ def assemble(
     if polished.world_alignment is not None:
         _place(result, polished.world_alignment)
     return result
+
+
+def _moving(polished: Polished, images: Sequence[MappedImage], frames: Sequence[SourceFrame]) -> Moving | None:
+    """What moves by itself, in the frames with a pose."""
+    return moving_in(
+        [images[position].tracks for position in polished.frames],
+        [frames[position].index for position in polished.frames],
+        np.union1d(polished.tracks, polished.moving),
+        polished.moving,
+    )
 
 
 # --- the world ----------------------------------------------------------------------------------------------------

@@ -12,15 +12,16 @@ from numpy.typing import NDArray
 from factorsfm.control.fit import ControlFit
 from factorsfm.lens.lens import LensEstimate
 from factorsfm.motion.shot_kind import LEAST_GAIN
+from factorsfm.motion.stretches import Stretch
 from factorsfm.polish.polished import Polished
+from factorsfm.result.moving import Moving
 from factorsfm.result.reconstruction import FrameResult, Reconstruction, RollingShutter
+from factorsfm.result.runs import runs
 from factorsfm.support.status import ShotKind
 
 # Worth a sentence: the prior gives at least half of the information, or a virtual object may visibly drift.
 _NOTED_SHARE = 0.5
 _NOTED_SLIDE_PX = 0.5
-_MERGED_GAP = 5  # registered frames between two weak stretches that are told as one
-_SHORTEST_STRETCH = 3  # frames
 _MOST_STRETCHES = 2  # sentences of each sort
 _AS_GOOD = 0.9  # cost over that of another reading, from which that is nearly as good
 # Of the variance, since errors of neighbouring tracks are alike: right solutions have 1 to 7, wrong ones 13 to 80.
@@ -82,14 +83,16 @@ def result_notes(
         depth_given: whether there is a depth prior; has_depth: whether a frame has a depth map.
         interval: seconds between two frames, 0 if unknown.
     """
-    notes = _motion_notes(polished, has_depth)
-    if polished.moving:
-        notes.append(
-            f"Something moves by itself: {100 * polished.moving:.0f} % of the longest tracks, which are left out. "
-            "Masks of it make the cameras better still."
-        )
+    notes = _motion_notes(polished, has_depth) + stretch_notes(result.stretches)
+    if result.moving is not None:
+        notes.append(moving_note(result.moving))
     if polished.lens is not None:
         notes.append(lens_note(polished.lens))
+    if polished.zoom:
+        notes.append(
+            f"The tracks ask for a zoom: one that changes the focal length by {polished.zoom:.2f} explains them far "
+            "better than one focal length; try --lens zoom."
+        )
     if polished.control is not None:
         notes += control_notes(polished.control)
     if polished.unused:
@@ -112,28 +115,67 @@ def result_notes(
 
 def _motion_notes(polished: Polished, has_depth: bool) -> list[str]:
     """What a camera that does not translate leaves open."""
-    motion = polished.motion
+    motion, zooms = polished.motion, polished.lens is not None and polished.lens.zooms
     depths = "depths and their scale come from the prior alone" if has_depth else "depths are unknown without a prior"
+    if motion.kind is ShotKind.STATIC and zooms:
+        return [f"The camera stays where it is and only zooms; {depths}."]
     if motion.kind is ShotKind.STATIC:
         return [f"The camera is static: no frame moves by more than {motion.displacement_px:.2f} pixels; {depths}."]
     if motion.kind is ShotKind.ROTATION:
         return [
-            "The camera only rotates: its translation is not observable from geometry and is reported as zero; "
+            f"The camera only {'rotates and zooms' if zooms else 'rotates'}: its translation is not observable from "
+            "geometry and is reported as zero; "
             f"{depths}."
         ]
     return []
 
 
+def stretch_notes(stretches: Sequence[Stretch]) -> list[str]:
+    """What the camera does when, of a shot that is not of one kind throughout."""
+    if len(stretches) < 2:
+        return []
+    does = {ShotKind.STATIC: "stands", ShotKind.ROTATION: "only turns", ShotKind.GENERAL: "moves"}
+    said = ", ".join(f"{does[s.kind]} in {s.first} to {s.last}" for s in stretches)
+    return [f"By frames, the camera {said}."]
+
+
+def moving_note(moving: Moving) -> str:
+    """How much of the shot moves by itself, and when."""
+    told = sorted(sorted(moving.stretches, key=lambda s: -s.image)[:_MOST_STRETCHES], key=lambda s: s.first)
+    said = [
+        f"frames {s.first} to {s.last}: {100 * s.tracks:.0f} % of the tracks, {100 * s.image:.0f} % of the image"
+        for s in told
+    ]
+    others = len(moving.stretches) - len(told)
+    more = f"; {others} other {'stretch' if others == 1 else 'stretches'} in summary.json" if others else ""
+    return (
+        f"Something moves by itself and is left out: {'; '.join(said)}{more}. "
+        "Masks of all that moves make the cameras better still."
+    )
+
+
+def _percent(share: float) -> str:
+    """A relative standard deviation in words; beyond 100 % a linear estimate has no digits that mean anything."""
+    return f"{100 * share:.1f} %" if share <= 1.0 else "of more than 100 %"
+
+
 def lens_note(estimate: LensEstimate) -> str:
     """What the shot says of an unknown lens."""
-    focals, std = estimate.lens.focal, f"standard deviation {100 * estimate.focal_std.max():.1f} %"
+    focals, std = estimate.lens.focal, f"standard deviation {_percent(estimate.focal_std.max())}"
     focal, zoom, held = float(np.median(focals)), "", not estimate.focal_std.any()
-    if estimate.zoom_std is not None and len(focals) == 1:
+    if estimate.zoom_std is not None and not estimate.zooms:
         zoom = f" No zoom was found: what it might be is less than {200 * estimate.zoom_std:.1f} %."
-    elif estimate.zoom_std is not None:
+    elif estimate.zooms:
         zoom = (
             f" It changes from {focals[0]:.0f} to {focals[-1]:.0f} pixels; the ratio of the longest to the shortest is "
             f"{focals.max() / focals.min():.3f} ± {estimate.zoom_std * focals.max() / focals.min():.3f}."
+        )
+        if not estimate.announced:
+            zoom += " Nobody announced this zoom; --lens focal keeps one focal length."
+    if estimate.contradicted_px:
+        zoom += (
+            f" What was known of it before says {estimate.contradicted_px:.0f} pixels, which the images contradict: "
+            "cropped or stretched pictures, or a rolling shutter, may explain it."
         )
     if not (estimate.determined or estimate.rough):
         reason = f"this shot does not determine it ({std})"
@@ -230,12 +272,12 @@ def observability_notes(frames: Sequence[FrameResult]) -> list[str]:
             f"{(1.0 - min(typical, 0.9999)) ** -0.5:.2g} times the error."
         )
         weak &= not weak.all()
-    for stretch in _stretches(weak, view_axis):
+    for stretch in _weakest(weak, view_axis):
         notes.append(
             f"{_frames(index[stretch])}: translation along the view axis comes "
             f"{100 * np.median(view_axis[stretch]):.0f} % from the depth prior."
         )
-    for stretch in _stretches(slide >= _NOTED_SLIDE_PX, slide):
+    for stretch in _weakest(slide >= _NOTED_SLIDE_PX, slide):
         notes.append(
             f"{_frames(index[stretch])}: a virtual object at the scene's median depth may drift by "
             f"{slide[stretch].max():.1f} pixels (one standard deviation)."
@@ -243,13 +285,10 @@ def observability_notes(frames: Sequence[FrameResult]) -> list[str]:
     return notes
 
 
-def _stretches(weak: NDArray[np.bool_], values: NDArray[np.float64]) -> list[slice]:
-    """The few runs of weak frames with the largest values, in order; runs with a short gap between are one."""
-    rows = np.nonzero(weak)[0]
-    runs = np.split(rows, np.nonzero(np.diff(rows) > _MERGED_GAP + 1)[0] + 1)
-    stretches = [slice(run[0], run[-1] + 1) for run in runs if len(run) >= min(_SHORTEST_STRETCH, len(weak))]
-    stretches.sort(key=lambda stretch: -np.median(values[stretch]))
-    return sorted(stretches[:_MOST_STRETCHES], key=lambda stretch: stretch.start)
+def _weakest(weak: NDArray[np.bool_], values: NDArray[np.float64]) -> list[slice]:
+    """The few stretches of weak frames with the largest values, in order."""
+    found = sorted(runs(weak), key=lambda stretch: -np.median(values[stretch]))
+    return sorted(found[:_MOST_STRETCHES], key=lambda stretch: stretch.start)
 
 
 def _frames(index: NDArray[np.int64]) -> str:

@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pycolmap
 
+from factorsfm.frames.frame import Frame
+from factorsfm.objects.moving import MovingThings, moving_things
 from factorsfm.objects.object_result import ObjectFrame, ObjectResult
-from factorsfm.objects.observed import ObservedObjects
-from factorsfm.objects.scale import PriorOnScene
+from factorsfm.objects.observed import ObservedObjects, RememberedDepth
+from factorsfm.objects.scale import PriorOnScene, ScaleSource
 from factorsfm.objects.solve import SceneCamera, solve_object
+from factorsfm.priors.depth import DepthPrior
 from factorsfm.result.reconstruction import Reconstruction
 from factorsfm.support.errors import InputError, ReconstructionError
 from factorsfm.support.json_reading import read_json, typed
 from factorsfm.support.options import Options
+from factorsfm.tracks.image_tracks import ImageTracks
 
 logger = logging.getLogger(__name__)
 
@@ -27,7 +32,7 @@ def add_objects(result: Reconstruction, observed: ObservedObjects, options: Opti
     """Solve the objects that were seen beside a finished scene; notes say of each how its scale is known, or why it is
     not solved."""
     lenses = {position: result.camera_of(frame) for position, frame in enumerate(result.frames) if frame.registered}
-    cameras = _scene_cameras(result)
+    cameras = _scene_cameras(result, observed.depth_on_things)
     solved = []
     for name in observed.names:
         try:
@@ -44,8 +49,55 @@ def add_objects(result: Reconstruction, observed: ObservedObjects, options: Opti
     result.objects = tuple(solved)
 
 
-def _scene_cameras(result: Reconstruction) -> dict[int, SceneCamera]:
-    """The registered frames by position."""
+@contextmanager
+def seen_again(
+    result: Reconstruction,
+    images: Sequence[ImageTracks],
+    frames: Iterable[Frame],
+    depth: DepthPrior | None,
+    options: Options,
+) -> Iterator[ObservedObjects]:
+    """The things that move by themselves beside a finished scene, as they are followed in its frames read once more.
+
+    Their tracks among those of the scene tell where they are. To solve them, they need more, and none that see what is
+    behind them.
+
+    Args:
+        images: what the scene was solved from, an image for each frame of the result.
+        frames: of the source; depth: the prior of the scene.
+    """
+    shown = [(position, frame) for position, frame in enumerate(result.frames) if frame.cam_from_world is not None]
+    seen = [
+        replace(images[position], position=position, index=frame.index, camera=result.camera_of(frame))
+        for position, frame in shown
+    ]
+    seen = [image.of(image.invertible) for image in seen]
+    poses = {position: frame.cam_from_world for position, frame in shown if frame.cam_from_world is not None}
+    things = moving_things(seen, poses, result.track_ids, options)
+    result.notes.append(_said(things))
+    remembered = RememberedDepth(depth) if depth is not None else None
+    of_scene = {frame.index: frame for frame in result.frames}
+    with ObservedObjects(things, None, remembered, options.tracker) as observed:
+        for frame in frames if things.places else ():
+            if frame.index not in of_scene:
+                continue
+            observed(frame)
+            if remembered is not None and of_scene[frame.index].prior is not None:
+                remembered(frame)
+            observed.push(frame)
+        yield observed
+
+
+def _said(things: MovingThings) -> str:
+    """What moves by itself, as a sentence."""
+    if not things.places and not things.loose:
+        return "Nothing moves by itself beside the scene."
+    large = "; ".join(things.described()) or "none is large enough, and seen for long enough, to be solved"
+    return f"Things that move by themselves: {large}. Tracks that belong to none of them: {things.loose}."
+
+
+def _scene_cameras(result: Reconstruction, on_things: float) -> dict[int, SceneCamera]:
+    """The registered frames by position; `on_things`: as in `PriorOnScene`."""
     cameras = {}
     everywhere = float(np.median(np.linalg.norm(result.points, axis=1))) if len(result.points) else 1.0
     order = np.argsort(result.observation_frame, kind="stable")
@@ -57,7 +109,7 @@ def _scene_cameras(result: Reconstruction) -> dict[int, SceneCamera]:
         depth = float(np.median((frame.cam_from_world * seen)[:, 2])) if len(seen) else everywhere
         prior = None
         if (fit := frame.prior) is not None:
-            prior = PriorOnScene(fit.scale, fit.shift, fit.scale_std, fit.shift_std, fit.sigma, fit.smooth)
+            prior = PriorOnScene(fit.scale, fit.shift, fit.scale_std, fit.shift_std, fit.sigma, fit.smooth, on_things)
         cameras[position] = SceneCamera(frame.index, frame.cam_from_world, depth, prior)
     return cameras
 
@@ -77,6 +129,7 @@ class _Frame:
 class _Object:
     name: str
     scale_std: float | None
+    scale_from: ScaleSource | None
     reprojection_error: float
     note: str
     frames: list[_Frame]
@@ -99,6 +152,7 @@ def _plain(found: ObjectResult) -> _Object:
     return _Object(
         found.name,
         found.scale_std,
+        found.scale_from,
         found.reprojection_error,
         found.note,
         [
@@ -145,6 +199,7 @@ def _object(plain: _Object) -> ObjectResult:
         colors=_array(plain.colors, (len(plain.points), 3), plain.name).astype(np.uint8),
         reprojection_error=plain.reprojection_error,
         scale_std=plain.scale_std,
+        scale_from=plain.scale_from,
         note=plain.note,
     )
 

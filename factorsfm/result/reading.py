@@ -15,7 +15,9 @@ from factorsfm.camera.files import camera_from_json, camera_to_json
 from factorsfm.camera.projection import PIXEL_CENTER
 from factorsfm.control.fit import ControlFit
 from factorsfm.inertial.fit import ImuFit
+from factorsfm.motion.stretches import Stretch
 from factorsfm.polish.observability import CameraObservability
+from factorsfm.result.moving import read_moving
 from factorsfm.result.objects import read_objects
 from factorsfm.result.reconstruction import FrameResult, LensFit, PriorFit, Reconstruction, RollingShutter
 from factorsfm.result.summary import part_name
@@ -49,6 +51,18 @@ class _Status:
 
 
 @dataclass(frozen=True, slots=True)
+class _Stretch:
+    """What summary.json says of a stretch."""
+
+    frames: list[int]
+    kind: ShotKind
+
+    def read(self) -> Stretch:
+        first, last = self.frames
+        return Stretch(first, last, self.kind)
+
+
+@dataclass(frozen=True, slots=True)
 class _Summary:
     """What summary.json says that the other files do not."""
 
@@ -66,6 +80,7 @@ class _Summary:
     parts: int
     statuses: list[_Status]
     doubts: list[str] = field(default_factory=list)
+    stretches: list[_Stretch] = field(default_factory=list)
 
 
 def read_result(directory: str | Path) -> Reconstruction:
@@ -86,6 +101,7 @@ def read_result(directory: str | Path) -> Reconstruction:
         summary = typed(_Summary, content, "summary.json")
         result = _reconstruction(summary, pycolmap.Reconstruction(directory / "colmap"))
         result.objects = read_objects(directory / "objects.json")
+        result.moving = read_moving(directory / "moving.json")
     except (InputError, OSError, ValueError, LookupError, RuntimeError) as error:
         raise InputError(f"the result in {directory} is damaged: {error}") from error
     result.others = [read_result(directory / part_name(number)) for number in range(2, summary.parts + 1)]
@@ -137,6 +153,7 @@ def _reconstruction(summary: _Summary, model: pycolmap.Reconstruction) -> Recons
         observation_error=np.concatenate([np.empty(0), *errors]),
         prior_residual=np.full(len(pixels), np.nan),
         kind=summary.kind,
+        stretches=tuple(stretch.read() for stretch in summary.stretches),
         parallax=summary.parallax,
         lens=summary.lens,
         shutter=summary.shutter,

@@ -14,8 +14,10 @@ if TYPE_CHECKING:
     import pycolmap
 from factorsfm.control.fit import ControlFit
 from factorsfm.inertial.fit import ImuFit
+from factorsfm.motion.stretches import Stretch
 from factorsfm.objects.object_result import ObjectResult
 from factorsfm.polish.observability import CameraObservability
+from factorsfm.result.moving import Moving
 from factorsfm.support.status import FrameStatus, ShotKind
 
 
@@ -174,6 +176,7 @@ class Reconstruction:
         prior_residual: (m,) residual of the depth prior relative to the predicted inverse depth
             ``scale / z``, NaN for an observation without prior.
         kind: what the motion allows one to recover.
+        stretches: what the camera does when, in numbers of frames; empty where the images are in no order of time.
         parallax: largest camera displacement over the median point depth (paper, section 4).
         point_std: (n,) relative standard deviation of the inverse distance of each point from the first registered
             camera, with the scale fixed as in `FrameResult.covariance`; None if unknown.
@@ -185,6 +188,8 @@ class Reconstruction:
         metric: whether the world unit is the metre (from a metric prior, or from control).
         control: how well the control is met, or factors that were added; None without either.
         imu: what an IMU has given, None without one that took part.
+        moving: what moves by itself, left out of all else; None where nothing was found. What a mask covers was never
+            looked at.
         doubts: why the images leave open what the camera does, in sentences; empty where they do not.
         objects: things that move by themselves and were asked for, as far as they could be solved.
         notes: sentences for the user (translation unobservable, focal length guessed, ...).
@@ -213,8 +218,10 @@ class Reconstruction:
     metric: bool = False
     control: ControlFit | None = None
     imu: ImuFit | None = None
+    moving: Moving | None = None
     doubts: list[str] = field(default_factory=list)
     objects: tuple[ObjectResult, ...] = ()
+    stretches: tuple[Stretch, ...] = ()
     notes: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
     options: dict[str, Any] = field(default_factory=dict)

@@ -121,6 +121,7 @@ class EndedShot:
             first_focal=(np.array([self.mapper.first_focal]), first_focal_std(self.camera, given=self.lens_given)),
             recording=self._recording(),
             suspects=self.suspects,
+            in_time=True,
         )
 
     def _recording(self) -> Recording | None:

@@ -1,4 +1,4 @@
-"""How the frames of a stream were recorded: pixels, fields, times, and frames that repeat the one before.
+"""How the frames of a stream were recorded: pixels, fields, bars, times, and frames that repeat the one before.
 
 A repeated frame is no evidence: it is not tracked. It gets the pose of the frame that it repeats, its twin.
 """
@@ -9,17 +9,20 @@ from collections.abc import Sequence
 from dataclasses import astuple, dataclass, replace
 from typing import Any, TypeVar
 
+import cv2
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
 from factorsfm.camera.files import fitted_camera
 from factorsfm.camera.guess import guess_camera
+from factorsfm.frames.bars import BarDetector
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.repeats import RepeatDetector
 from factorsfm.frames.timing import are_uneven, cadence, frame_interval, frame_times
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.streaming.frame_update import FrameUpdate, SeenFrame, repeated_update
+from factorsfm.support.picture_area import PictureArea
 
 _MOST_NOTED = 3  # repeated frames that are named
 
@@ -47,6 +50,9 @@ class Footage:
         self.repeats: list[Repeat] = []
         self._pixel_aspect, self._is_field = 1.0, False
         self._detector = RepeatDetector()
+        self._bars = BarDetector()
+        self._picture: PictureArea | None = None
+        self._shape: tuple[int, ...] = (0, 0)
         self._last: FrameUpdate | None = None
 
     def opened(self, frame: Frame, camera: pycolmap.Camera | None) -> pycolmap.Camera:
@@ -58,8 +64,22 @@ class Footage:
         height, width = frame.image.shape[:2]
         self._pixel_aspect, self._is_field = frame.pixel_aspect, frame.is_field
         if camera is None:
-            return guess_camera(width, height, frame.path, frame.pixel_aspect)
+            picture = BarDetector().push(_grey(frame))
+            return guess_camera(width, height, frame.path, frame.pixel_aspect, picture)
         return fitted_camera(camera, width, height, frame.pixel_aspect)
+
+    def seen(self, frame: Frame) -> tuple[Frame, NDArray[np.uint8]]:
+        """The next frame with what of it is picture, and its grey image, (h, w)."""
+        grey = _grey(frame)
+        self._picture, self._shape = self._bars.push(grey), grey.shape
+        return replace(frame, picture=self._picture), grey
+
+    def ignored(self, mask: NDArray[np.bool_] | None, border_px: int) -> NDArray[np.bool_] | None:
+        """The mask of the newest frame with its bars, to which tracks keep their distance as to the border."""
+        if self._picture is None:
+            return mask
+        bars = self._picture.outside(self._shape, border_px)
+        return bars if mask is None else mask | bars
 
     def repeated(self, frame: Frame, grey: NDArray[np.uint8], taken: int) -> FrameUpdate | None:
         """What is known of a frame that repeats the last one, which is kept here; None of one that does not.
@@ -118,12 +138,14 @@ class Footage:
         return {
             "repeats": [astuple(repeat) for repeat in self.repeats],
             "pixels": (self._pixel_aspect, self._is_field),
+            "bars": self._bars.state(),
         }
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from a state; the next frame counts as new."""
         self.repeats = [Repeat(*repeat) for repeat in state["repeats"]]
         self._pixel_aspect, self._is_field = state["pixels"]
+        self._bars.restore(state["bars"])
 
     def _positions(self, count: int) -> list[int]:
         """Positions among all frames of those that repeat none."""
@@ -149,6 +171,9 @@ class Footage:
                 f"Pixels are {self._pixel_aspect:.4g} times as wide as high: the focal length is "
                 f"{camera.focal_length_x:.0f} pixels across and {camera.focal_length_y:.0f} down."
             )
+        if self._picture is not None:
+            bars = self._picture.said(camera.width, camera.height)
+            notes.append(f"Black bars, {bars}, are no part of the picture: nothing is tracked in them.")
         indices, timestamps = [frame.index for frame in frames], [frame.timestamp for frame in frames]
         interval, rhythm = frame_interval(indices, timestamps), self._cadence(frames)
         if self.repeats:
@@ -172,6 +197,10 @@ class Footage:
         if new == period - 1:
             return f"Every {_ordinal(period)}frame repeats the one before{rates}."
         return f"Of every {period} frames {period - new} repeat the one before{rates}."
+
+
+def _grey(frame: Frame) -> NDArray[np.uint8]:
+    return np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY), np.uint8)
 
 
 def _ordinal(number: int) -> str:

@@ -55,8 +55,8 @@ class FrameUpdate:
         dropped: frames that a live source dropped right before this one.
         shot: number of the shot in an `Episode`.
         focal_length: pixels, as the stream has it now; focal_changed: whether this frame changed it.
-        starts_anew: whether the start of the map was given up with this frame, because none of those that followed
-            joined it: all poses that were given before are void.
+        starts_anew: whether all poses that were given before are void: with this frame the map was given up, or began
+            again without what had bent it while it was young. `note` says why.
         note: one sentence on what became of the map with this frame, where that is out of the ordinary: a start that
             was given up or begins again without what moves by itself, a depth prior without which the stream goes on;
             else empty.
@@ -117,8 +117,8 @@ def frame_update(
     return FrameUpdate(
         frame.index, image.status, image.message, pose_of(image), image.keyframe, len(image.tracks.ids),
         image.inliers, mapper.new_points, mapper.parallax, image.covariance, _newest_prior(mapper, frames),
-        frame.dropped, focal_length=mapper.focal, focal_changed=focal_changed, starts_anew=mapper.starts_anew,
-        note=mapper.note,
+        frame.dropped, focal_length=mapper.focal, focal_changed=focal_changed,
+        starts_anew=mapper.starts_anew or mapper.begins_again, note=mapper.note,
     )  # fmt: skip
 
 

@@ -9,7 +9,6 @@ from dataclasses import astuple
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
@@ -100,8 +99,7 @@ class Stream(Closing):
         self.seconds = StageSeconds()
         self.frames: list[SeenFrame] = []
         self._depth = depth if self.options.uses_depth else None
-        self._held = ExitStack()
-        self._closed = False
+        self._held, self._closed = ExitStack(), False
         self._tracker = self._held.enter_context(FlowTracker(self.options.tracker))
         self._suspicion = self._held.enter_context(Suspicion(masks, self.options.mapper.min_tracks))
         self._finder = ViewFinder(self._tracker)
@@ -129,12 +127,12 @@ class Stream(Closing):
         self._check_open("takes no further frame")
         frame = as_frame(frame, len(self.frames))
         time = self._imu.check_time(frame.index, frame.timestamp) if self._imu is not None else 0.0
-        mapper = self._mapper or self._open(frame)
+        mapper = self._mapper = self._mapper or self._open(frame)
         focal_changed = self._follow_focal(mapper)
         check_size(frame, self._size)
+        frame, grey = self._footage.seen(frame)
         with self.seconds.of("masks"):
-            mask = read_mask(self._suspicion.sure, frame)
-        grey = np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY), np.uint8)
+            mask = self._footage.ignored(read_mask(self._suspicion.sure, frame), self.options.tracker.border_px)
         if (repeated := self._footage.repeated(frame, grey, len(self.frames))) is not None:
             return repeated
         with self.seconds.of("tracking"):
@@ -230,15 +228,18 @@ class Stream(Closing):
         """(n, 2) tracked points of the newest frame (pixels), and (n,) whether the map holds them."""
         if self._mapper is None or not self._mapper.images:
             return np.zeros((0, 2)), np.zeros(0, bool)
-        tracks = self._mapper.images[-1].tracks
-        return tracks.pixels, self._mapper.points.contains(tracks.ids)
+        return self._mapper.images[-1].tracks.pixels, self._mapper.points.contains(self.track_ids)
+
+    def all_tracks(self) -> list[ImageTracks]:
+        """The tracks of every frame so far, whether the map holds them or not; a repeated frame has its twin's."""
+        images = self._mapper.images if self._mapper is not None else []
+        return self._footage.with_repeats([image.tracks for image in images])
 
     @property
     def track_ids(self) -> NDArray[np.int64]:
         """(n,) of the `tracks` of the newest frame: the j of ``L(j)`` where the map holds them."""
-        if self._mapper is None or not self._mapper.images:
-            return np.zeros(0, np.int64)
-        return self._mapper.images[-1].tracks.ids
+        images = self._mapper.images if self._mapper is not None else []
+        return images[-1].tracks.ids if images else np.zeros(0, np.int64)
 
     def save(self, path: str | Path) -> None:
         """Write everything that is known so far as one file, whole or not at all; the stream can go on.
@@ -363,8 +364,7 @@ class Stream(Closing):
         if self.options.estimates_lens:
             distortion_of(self.camera)  # refuses what cannot be estimated
         self._size = (self.camera.width, self.camera.height)
-        mapper = self._mapper = self._new_mapper()
-        return mapper
+        return self._new_mapper()
 
     def _follow_focal(self, mapper: Mapper) -> bool:
         """Take over the camera of the mapper's images; whether it has another focal length."""
@@ -383,14 +383,13 @@ class Stream(Closing):
     def _read_depth(self, frame: Frame, xy: NDArray[np.float64]) -> ImageDepth | None:
         """The prior at keypoints; once there is a map, a frame on which it fails goes without."""
         assert self._depth is not None
-        assert self._mapper is not None
         if frame.index in self._without_depth:
             return None
         with self.seconds.of("depth"):
             try:
                 return read_depth(self._depth, frame, xy)
             except ModelError as error:
-                if not self._mapper.started:
+                if self._mapper is None or not self._mapper.started:
                     raise
                 logger.warning("%s; the frame goes without", error)
                 self._without_depth[frame.index] = str(error)

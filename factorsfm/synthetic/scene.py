@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from factorsfm.camera.projection import PIXEL_CENTER
 from factorsfm.support.errors import InputError
 
-Motion = Literal["dolly", "truck", "handheld", "rotation", "static", "arc"]
+Motion = Literal["dolly", "truck", "handheld", "rotation", "static", "arc", "stages"]
 Floats = NDArray[np.float64]
 
 FIELD_OF_VIEW = np.radians(54.0)  # horizontal
@@ -93,7 +93,7 @@ def synthetic_scene(
     """Random points between 2 and 8 units in front of a camera of 640x360 pixels.
 
     Args:
-        motion: camera path; "rotation" and "static" do not translate.
+        motion: camera path; "rotation" and "static" do not translate, "stages" stands, pans, and trucks in turn.
         frames: number of frames, at least 2.
         points: number of points; some enter or leave the image.
         parallax: largest distance of a camera from the first one over the median depth of all points in the first
@@ -158,6 +158,9 @@ def camera_path(motion: str, frames: int, parallax: float, depth: float, seed: i
         angle = 2 * np.arcsin(parallax / 2) * time
         centers = np.column_stack([np.sin(angle), np.zeros(frames), 1 - np.cos(angle)])
         rotations[:, 1] = -angle
+    elif motion == "stages":  # a third each: it stands, then pans, then trucks
+        rotations[:, 1] = _PAN * np.clip(3 * time - 1, 0, 1)
+        centers[:, 0] = np.clip(3 * time - 2, 0, 1)
     elif motion == "handheld":
         generator = np.random.default_rng([seed, 1])
         cycles, phase = generator.uniform(0.5, 2.5, (3, 6)), generator.uniform(0, 2 * np.pi, (3, 6))

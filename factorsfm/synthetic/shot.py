@@ -54,7 +54,7 @@ def render_shot(
     """Render a textured room with boxes between 2 and 7 units in front of the camera.
 
     Args:
-        motion: camera path; "rotation" and "static" do not translate.
+        motion: camera path; "rotation" and "static" do not translate, "stages" stands, pans, and trucks in turn.
         frames: number of frames, at least 2.
         width, height: pixels.
         parallax: largest distance of a camera from the first one over the median depth of the first image,

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.support.options import TrackerOptions
+from factorsfm.support.semidefinite import solution
 from factorsfm.tracks.grey import GreyFrame
 from factorsfm.tracks.parts import in_parts
 
@@ -105,12 +106,12 @@ def robust_fit(design: NDArray[np.float64], target: Array) -> NDArray[np.float64
         target: (n, 2) pixels.
     """
     rows, columns = design.shape
-    solution: NDArray[np.float64] = np.zeros((columns, 2))
+    found: NDArray[np.float64] = np.zeros((columns, 2))
     weight = np.ones(rows)
     for _ in range(_FIT_ITERATIONS if rows >= 2 * columns else 0):
         weighted = design * weight[:, None]
         normal = weighted.T @ design + _FIT_RIDGE * np.eye(columns)
-        solution = np.asarray(np.linalg.solve(normal, weighted.T @ target), np.float64)
-        error = np.linalg.norm(design @ solution - target, axis=1)
+        found = solution(normal, weighted.T @ target)
+        error = np.linalg.norm(design @ found - target, axis=1)
         weight = 1.0 / (1.0 + (error / max(float(np.sort(error)[rows // 2]), _LEAST_FIT_SCALE_PX)) ** 2)
-    return solution
+    return found

@@ -29,7 +29,9 @@ MAX_FEATURES = 8192  # per image
 EXHAUSTIVE_UP_TO = 60  # images; in a larger set each is matched with its neighbours by appearance and by name
 _NEIGHBOURS_BY_APPEARANCE, _NEIGHBOURS_BY_NAME = 25, 4
 _VISUAL_WORDS, _SAMPLED_DESCRIPTORS = 256, 100_000  # of the vocabulary, which is made from the set itself
-_ONE_THREAD_ABOVE = 6e6  # pixels of an image: SIFT needs about 150 bytes for each of them
+# Pixels of an image that SIFT looks at in double size, for which it needs 240 bytes for each; else 30. The largest
+# features of an image come first: a large one has enough of them without its finest.
+_DOUBLED_UP_TO = 6e6
 _SEED = 0
 
 
@@ -86,10 +88,11 @@ def match_images(
         logger.info("the matches in %s are of other images and are computed again", database)
         database.unlink()
     with _quiet_colmap():
+        _import(database, images, names, cameras)
         if features is not None:
-            _match_learned(database, images, names, cameras, masks, features)
+            _match_learned(database, images, names, masks, features)
             return read_matches(database, names)
-        _extract(database, images, names, cameras, masks)
+        _extract(database, images, names, masks, max(c.width * c.height for c in cameras))
         if len(names) <= EXHAUSTIVE_UP_TO:
             pycolmap.match_exhaustive(database, verification_options=_verification())
         else:
@@ -114,7 +117,7 @@ def read_matches(database: Path, names: Sequence[str]) -> SetMatches:
             rows = np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)
             if len(rows) and a in position and b in position:
                 first, second = position[a], position[b]
-                if first > second:  # the database numbers images in the order in which their features were found
+                if first > second:  # in a work folder, images that came later have the larger numbers
                     first, second, rows = second, first, rows[:, ::-1]
                 pairs.append(PairMatches(first, second, rows))
     return SetMatches(keypoints, sorted(pairs, key=lambda pair: (pair.first, pair.second)))
@@ -128,13 +131,11 @@ def _stored_names(database: Path) -> set[str]:
         raise InputError(f"{database} is not a database of COLMAP; remove it, or name another work folder") from error
 
 
-def _extract(
-    database: Path, images: Path, names: Sequence[str], cameras: Sequence[pycolmap.Camera], masks: Path | None
-) -> None:
+def _extract(database: Path, images: Path, names: Sequence[str], masks: Path | None, pixels: int) -> None:
+    """Find SIFT features of images of so many pixels at most."""
     options = pycolmap.FeatureExtractionOptions()
     options.sift.max_num_features = MAX_FEATURES
-    if max(c.width * c.height for c in cameras) > _ONE_THREAD_ABOVE:
-        options.num_threads = 1
+    options.sift.first_octave = -1 if pixels <= _DOUBLED_UP_TO else 0
     reader = pycolmap.ImageReaderOptions()
     if masks is not None:
         reader.mask_path = masks
@@ -146,10 +147,15 @@ def _extract(
         reader_options=reader,
         extraction_options=options,
     )
-    _set_cameras(database, names, cameras)
 
 
-def _set_cameras(database: Path, names: Sequence[str], cameras: Sequence[pycolmap.Camera]) -> None:
+def _import(database: Path, images: Path, names: Sequence[str], cameras: Sequence[pycolmap.Camera]) -> None:
+    """Number the images by name: in the order in which their features are found, pairs would be verified either way
+    round, and each run would have other matches."""
+    with pycolmap.Database.open(database) as db:  # makes the file
+        new = [name for name in names if db.read_image_with_name(name) is None]
+    if new:
+        pycolmap.import_images(database, images, camera_mode=pycolmap.CameraMode.PER_IMAGE, image_names=new)
     with pycolmap.Database.open(database) as db:
         for name, camera in zip(names, cameras, strict=True):
             if (image := db.read_image_with_name(name)) is not None:
@@ -194,16 +200,10 @@ def _match_learned(
     database: Path,
     images: Path,
     names: Sequence[str],
-    cameras: Sequence[pycolmap.Camera],
     masks: Path | None,
     features: LearnedFeatures,
 ) -> None:
     """Find and match learned features; neighbours by appearance share most of their strongest keypoints."""
-    with pycolmap.Database.open(database) as db:  # makes the file
-        new = [name for name in names if db.read_image_with_name(name) is None]
-    if new:
-        pycolmap.import_images(database, images, camera_mode=pycolmap.CameraMode.PER_IMAGE, image_names=new)
-    _set_cameras(database, names, cameras)
     keypoints = find_all(database, images, names, features, masks)
     distance = np.abs(np.subtract.outer(np.arange(len(names)), np.arange(len(names))))
     chosen = distance > 0

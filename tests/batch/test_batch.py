@@ -211,6 +211,13 @@ def test_masks_are_those_of_the_whole_video(tmp_path: Path, film: Path) -> None:
     assert [job.method.objects for job in jobs] == [None, str(tmp_path / "masks")]
 
 
+@pytest.mark.parametrize("several", [False, True])
+def test_things_are_found_by_their_motion_in_every_shot(tmp_path: Path, film: Path, several: bool) -> None:
+    (video,) = find_videos(film)
+    jobs = plan_jobs({video: SHOTS}, Method(objects="auto"), tmp_path / "out", several=several)
+    assert [job.method.objects for job in jobs] == ["auto", "auto"]
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

@@ -134,6 +134,26 @@ def test_image_names_with_line_breaks(folder: Path, capsys: pytest.CaptureFixtur
     capsys.readouterr()
 
 
+def test_a_link_that_leads_nowhere_is_a_frame_that_cannot_be_read(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "images" / "3.png").symlink_to("nowhere.png")
+    assert reconstruct("images") == 2
+    assert_error(capsys.readouterr(), "image images/3.png cannot be read: No such file or directory")
+    (folder / "images" / "3.png").unlink()
+    (folder / "images" / "3.png").symlink_to("3.png")
+    assert reconstruct("images") == 2
+    assert_error(capsys.readouterr(), "image images/3.png cannot be read: Too many levels of symbolic links")
+    assert not (folder / "out").exists()
+
+
+def test_a_link_that_leads_nowhere_does_not_end_a_batch(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "films").mkdir()
+    (folder / "films" / "gone.mp4").symlink_to("nowhere.mp4")
+    assert status_of("batch", "films", "--output", "out", "--depth", "none", "--workers", "1") == 2
+    assert_error(capsys.readouterr(), "gone.mp4 does not exist")
+
+
 # --- images, ranges and sizes -------------------------------------------------------------------------------------
 
 

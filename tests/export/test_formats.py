@@ -160,15 +160,20 @@ def test_nerfstudio_refuses_what_it_cannot_hold(tmp_path: Path) -> None:
 
 
 # Nuke: rotation order ZXY turns about z first; the projection follows the matrices that Nuke's own scripts use
-# (nukescripts.snap3d): window translation and scale act on coordinates that run from -1 to 1 over the width.
+# (nukescripts.snap3d): window translation and scale act on coordinates that run from -1 to 1 over the width, and lines
+# are as far apart as the pixel aspect of the format says.
 
 
-def nuke_pixels(camera: dict[str, Any], world_from_film: Array, points: Array) -> Array:
+def nuke_aspect(node: dict[str, Any]) -> float:
+    return float(node["format"].strip('"').split()[6])
+
+
+def nuke_pixels(camera: dict[str, Any], world_from_film: Array, points: Array, aspect: float) -> Array:
     x, y, z = in_film_camera(world_from_film, points).T
     window = 2 * camera["focal"] / camera["haperture"] * np.column_stack([x, y]) / -z[:, None]
     window = (window - camera["win_translate"]) / camera["win_scale"]
     width, height = 640, 480
-    return np.column_stack([(window[:, 0] + 1) * width / 2, height - (window[:, 1] * width / 2 + height / 2)])
+    return np.column_stack([(window[:, 0] + 1) * width / 2, height - (window[:, 1] * aspect * width / 2 + height / 2)])
 
 
 def nuke_rotation(x: float, y: float, z: float) -> Array:
@@ -188,7 +193,8 @@ def test_nuke_script_projects_as_pycolmap(tmp_path: Path) -> None:
     nodes = nuke_nodes((tmp_path / "out" / "camera.nk").read_text())
     root, camera = nodes["Root"], nodes["Camera"]
     assert (root["first_frame"], root["last_frame"], root["fps"]) == ("111", "121", "25")
-    assert root["format"].strip('"').split()[:7] == ["640", "480", "0", "0", "640", "480", "1"]
+    assert root["format"].strip('"').split()[:6] == ["640", "480", "0", "0", "640", "480"]
+    assert nuke_aspect(root) == nuke_aspect(nodes["Plate"]) == pytest.approx(640 / 600, abs=1e-9)
     assert nodes["NotRegistered"]["label"] == '"No camera at frames 117"'
     assert (camera["class"], camera["rot_order"]) == ("Camera2", "ZXY")
     assert float(camera["focal"]) == pytest.approx(600 * 24.89 / 640, rel=1e-9)
@@ -201,7 +207,8 @@ def test_nuke_script_projects_as_pycolmap(tmp_path: Path) -> None:
     assert_same_cameras(found, true_world_from_film(reconstruction, "y", HAND))
     for position in range(5):
         points, pixels = seen_points(reconstruction, position)
-        np.testing.assert_allclose(nuke_pixels(knobs, found[position], moved(points, "y", HAND)), pixels, atol=PIXEL)
+        projected = nuke_pixels(knobs, found[position], moved(points, "y", HAND), nuke_aspect(root))
+        np.testing.assert_allclose(projected, pixels, atol=PIXEL)
 
 
 def test_nuke_angles_do_not_jump(tmp_path: Path) -> None:

@@ -34,7 +34,7 @@ def moving(name: str = "red car", seed: int = 3) -> ObjectResult:
         for k, index in enumerate(INDICES)
     ]
     colors = rng.integers(0, 256, (7, 3)).astype(np.uint8)
-    return ObjectResult(name, tuple(frames), rng.uniform(-1, 1, (7, 3)), colors, 0.1, 0.05, "")
+    return ObjectResult(name, tuple(frames), rng.uniform(-1, 1, (7, 3)), colors, 0.1, 0.05, "prior", "")
 
 
 def with_objects(*objects: ObjectResult) -> Reconstruction:

@@ -1,6 +1,7 @@
 """Plates: EXR, DPX, and images of 16 bits, written here by other tools than those that read them."""
 
 import logging
+import struct
 from pathlib import Path
 
 import cv2
@@ -8,7 +9,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from factorsfm.frames.folders import read_image, read_pixels
+from factorsfm.frames.folders import read_image, read_pixels, stated_pixel_aspect
 from factorsfm.frames.numbering import missing_numbers, numbered_images, sequence_of
 from factorsfm.frames.ranges import parse_range
 from factorsfm.frames.reading import read_frames
@@ -85,6 +86,28 @@ def test_damaged_plates_are_named(tmp_path):
             read_image(tmp_path / name)
     with pytest.raises(InputError, match=r"e\.exr cannot be read: No such file"):
         read_image(tmp_path / "e.exr")
+
+
+def test_damaged_plates_say_nothing_on_standard_error(tmp_path, capfd):
+    write_exr(tmp_path / "a.exr", {"RGB": colors(np.float16, 1)})
+    data = (tmp_path / "a.exr").read_bytes()
+    for share in (0.1, 0.5, 0.99):
+        (tmp_path / "a.exr").write_bytes(data[: int(share * len(data))])
+        with pytest.raises(InputError, match=r"a\.exr cannot be decoded"):
+            read_image(tmp_path / "a.exr")
+    assert capfd.readouterr().err == ""
+
+
+def test_pixel_aspect_of_plates(tmp_path):
+    write_exr(tmp_path / "a.1.exr", {"RGB": colors(np.float16, 1)}, pixelAspectRatio=2.0)
+    assert next(read_frames(tmp_path)).pixel_aspect == 2.0
+    assert next(read_frames(tmp_path, pixel_aspect=1.5)).pixel_aspect == 1.5
+    for order, magic in ((">", b"SDPX"), ("<", b"XPDS")):
+        for aspect, expected in (((4, 3), 4 / 3), ((0, 1), 1.0), ((2**32 - 1, 2**32 - 1), 1.0)):
+            (tmp_path / "a.dpx").write_bytes(magic + bytes(1624) + struct.pack(f"{order}2I", *aspect))
+            assert stated_pixel_aspect(tmp_path / "a.dpx") == pytest.approx(expected)
+    (tmp_path / "a.dpx").write_bytes(b"SDPX")
+    assert stated_pixel_aspect(tmp_path / "a.dpx") == 1.0
 
 
 @pytest.mark.parametrize("endian", ["little", "big"])

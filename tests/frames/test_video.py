@@ -10,32 +10,21 @@ import pytest
 from factorsfm.frames.ranges import parse_range
 from factorsfm.frames.reading import read_frames
 from factorsfm.support.errors import InputError
-from tests.video_files import BT709, BT2020, FULL, HLG, LIMITED, PQ, interlaced, moving_texture, woven, write_video
+from tests.video_files import (
+    BT709,
+    BT2020,
+    FORMATS,
+    FULL,
+    HLG,
+    LIMITED,
+    PQ,
+    interlaced,
+    moving_texture,
+    woven,
+    write_video,
+)
 
 LOSSLESS = {"codec": "ffv1", "pixels": "bgr0"}
-QUIET_H265 = {"x265-params": "log-level=none"}
-DNXHR = {"profile": "dnxhr_hq"}
-
-# suffix, codec, pixels, options: what cameras, phones, editors and the web hand out.
-FORMATS = [
-    (".mp4", "libx264", "yuv420p", {}),
-    (".mp4", "libx265", "yuv420p10le", QUIET_H265),
-    (".mov", "prores_ks", "yuv422p10le", {}),
-    (".mov", "prores_ks", "yuva444p10le", {"profile": "4444"}),
-    (".mov", "dnxhd", "yuv422p", DNXHR),
-    (".mxf", "dnxhd", "yuv422p", DNXHR),
-    (".mxf", "mpeg2video", "yuv422p", {}),
-    (".mkv", "libx264", "yuv420p10le", {}),
-    (".webm", "libvpx-vp9", "yuv420p", {}),
-    (".mpg", "mpeg2video", "yuv420p", {}),
-    (".m2ts", "libx264", "yuv420p", {}),
-    (".ts", "mpeg2video", "yuv420p", {}),
-    (".avi", "mjpeg", "yuvj420p", {}),
-    (".avi", "mpeg4", "yuv420p", {}),
-    (".wmv", "wmv2", "yuv420p", {}),
-    (".mkv", "ffv1", "bgr0", {}),
-    (".gif", "gif", "gray", {}),
-]
 
 
 def grey(image: np.ndarray) -> np.ndarray:
@@ -95,6 +84,37 @@ def test_uneven_times_are_kept(tmp_path):
     times = [0, 4, 8, 12, 20, 28, 36]
     path = write_video(tmp_path / "shot.mkv", moving_texture(7), **LOSSLESS, times=times)
     assert [frame.timestamp for frame in read_frames(path)] == pytest.approx(np.array(times) / 100, abs=1e-3)
+
+
+def test_a_file_that_grows_is_read_as_far_as_it_was_and_warned_of(tmp_path, caplog):
+    path = write_video(tmp_path / "shot.ts", moving_texture(40), "mpeg2video")
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    frames = read_frames(path)
+    next(frames)
+    count = 1 + sum(1 for _ in frames)
+    assert not caplog.messages
+    path.write_bytes(data[: len(data) // 2])
+    frames = read_frames(path)
+    next(frames)
+    with path.open("ab") as file:
+        file.write(data[len(data) // 2 :])
+    assert count <= 1 + sum(1 for _ in frames) <= 40
+    assert any("more was written to it while it was read" in message for message in caplog.messages)
+
+
+def test_a_file_that_vanishes_with_its_network_is_no_shorter_file(tmp_path, monkeypatch):
+    path = write_video(tmp_path / "shot.mkv", moving_texture(30), **LOSSLESS)
+    frames = read_frames(path)
+    next(frames)
+
+    def fail(_: object) -> None:
+        raise av.error.OSError(5, "Input/output error")
+
+    monkeypatch.setattr("factorsfm.frames.video._packet_frames", fail)
+    path.unlink()
+    with pytest.raises(InputError, match=r"shot\.mkv cannot be read any more: No such file"):
+        list(frames)
 
 
 # --- fields -------------------------------------------------------------------------------------------------------

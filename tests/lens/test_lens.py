@@ -18,7 +18,7 @@ from factorsfm.camera.projection import PIXEL_CENTER, normalized_from_pixels
 from factorsfm.cli.main import main
 from factorsfm.lens.camera_model import distortion_of, with_distortion
 from factorsfm.lens.certainty import _left_out_covariance, lens_covariances
-from factorsfm.lens.lens import through
+from factorsfm.lens.lens import Lens, LensEstimate, through
 from factorsfm.lens.search import search_lens
 from factorsfm.lens.solver import LensSolver
 from factorsfm.polish.camera_starts import _everywhere
@@ -400,3 +400,18 @@ def test_a_match_that_is_seen_far_outside_of_the_image_says_nothing_of_the_disto
     std, other_std = (s[adjustment.columns.lens][:2] for s in (std, other_std))
     assert ((other_std / std > 0.7) & (other_std / std < 2.0)).all()
     assert (np.abs(beside_it - without) < 2.0 * std).all()
+
+
+@pytest.mark.parametrize(("first_std", "contradicted"), [(0.03, True), (0.3, False)])
+def test_a_focal_length_of_exif_data_that_the_images_contradict_is_told(first_std, contradicted):
+    problem = make_problem("arc", frames=10, points=200, parallax=0.3, noise_px=0.05)
+    result = estimated(problem, guess=1.25, first_std=first_std, lens="focal")
+    assert result.lens.lens.focal[0] == pytest.approx(problem.focal, rel=0.002)
+    assert result.lens.contradicted_px == pytest.approx(1.25 * problem.focal if contradicted else 0.0)
+    assert ("which the images contradict" in lens_note(result.lens)) == contradicted
+
+
+def test_a_deviation_without_meaning_has_no_digits():
+    lens = Lens(np.array([900.0]))
+    wild = LensEstimate(lens, np.array([2749.9]), np.full(6, np.nan), misfit_px=0.0, determined=False)
+    assert lens_note(wild).endswith("this shot does not determine it (standard deviation of more than 100 %).")

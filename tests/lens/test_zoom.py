@@ -9,6 +9,7 @@ from factorsfm import Options, Stream
 from factorsfm.lens.lens import through
 from factorsfm.polish.polish import polish
 from factorsfm.report.result_folder import write_folder
+from factorsfm.result.notes import _motion_notes, lens_note
 from factorsfm.result.reading import read_result
 from factorsfm.result.summary import focal_range, summary
 from factorsfm.support.options import DETERMINED_FOCAL_STD
@@ -25,17 +26,17 @@ def profile(zoom, frames=FRAMES):
     return zoom ** (time**2 * (3 - 2 * time))
 
 
-def polished(motion, zoom, *, parallax, guess=1.15, max_frames=400, noise_px=0.05):
+def polished(motion, zoom, *, parallax, guess=1.15, max_frames=400, noise_px=0.05, lens="zoom"):
     """The polish of a shot that zooms, from tracks normalised by one wrong focal length and a map without zoom."""
     problem = make_problem(motion, frames=FRAMES, points=200, parallax=parallax, noise_px=noise_px)
     o = problem.observations
     start = through(problem.truth, guess * np.exp(problem.truth.log_focal))
     seen = replace(problem, observations=replace(o, pixels=o.pixels * profile(zoom)[o.frame, None]))
-    options = replace(Options.preset_named("geometry"), lens="zoom")
+    options = replace(Options.preset_named("geometry"), lens=lens)
     options = replace(options, polish=replace(options.polish, max_frames=max_frames))
     points = np.arange(len(start.bearing)), start.points
-    result = polish(mapped_images(seen, start, guess=guess), points, guess * np.exp(problem.truth.log_focal), options)
-    return problem, result
+    focal = guess * np.exp(problem.truth.log_focal)
+    return problem, polish(mapped_images(seen, start, guess=guess), points, focal, options, in_time=True)
 
 
 @pytest.mark.parametrize(("motion", "parallax"), [("arc", 0.3), ("rotation", 0.0)])
@@ -65,6 +66,41 @@ def test_no_zoom_is_found_where_there_is_none():
     assert result.lens.determined
     assert 1e-4 < result.lens.zoom_std < 1e-3
     assert result.state.focal[0] == pytest.approx(problem.focal, rel=0.0015)
+
+
+@pytest.mark.parametrize("motion", ["arc", "handheld", "rotation"])
+def test_a_zoom_that_nobody_announced_is_recognised(motion):
+    _, result = polished(motion, 1.4, parallax=0.0 if motion == "rotation" else 0.2, lens="distortion")
+    assert not result.lens.announced
+    assert result.lens.zooms
+    course = result.state.focal / result.state.focal[0]
+    np.testing.assert_allclose(course, profile(1.4), rtol=3e-3)
+    assert "Nobody announced this zoom" in lens_note(result.lens)
+    assert result.motion.kind is (ShotKind.ROTATION if motion == "rotation" else ShotKind.GENERAL)
+    assert result.zoom == 0.0
+
+
+def test_a_fixed_camera_that_zooms_does_not_travel():
+    """To one focal length, a zoom is a way towards a wall."""
+    _, result = polished("static", 1.4, parallax=0.0, lens="distortion")
+    assert result.lens.zooms
+    assert result.motion.kind is ShotKind.STATIC
+    np.testing.assert_allclose(result.state.focal / result.state.focal[0], profile(1.4), rtol=1e-3)
+    assert _motion_notes(result, False)[0].startswith("The camera stays where it is and only zooms;")
+
+
+@pytest.mark.parametrize(("motion", "parallax"), [("dolly", 0.2), ("dolly", 0.03), ("handheld", 0.05), ("arc", 0.3)])
+def test_a_move_is_no_zoom(motion, parallax):
+    _, result = polished(motion, 1.0, parallax=parallax, lens="distortion")
+    assert len(result.state.log_focal) == 1
+    assert result.lens.zoom_std is None
+    assert result.motion.kind is ShotKind.GENERAL
+
+
+def test_a_given_lens_is_kept_where_the_tracks_ask_for_a_zoom():
+    problem, result = polished("handheld", 1.4, parallax=0.1, guess=1.0, lens="fixed")
+    np.testing.assert_array_equal(result.state.focal, problem.focal)
+    assert result.zoom == pytest.approx(1.4, rel=0.01)
 
 
 def test_frames_between_the_solved_ones_have_the_focal_length_between():

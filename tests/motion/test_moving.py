@@ -7,7 +7,7 @@ import pytest
 
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.problem import ErrorModel
-from factorsfm.motion.moving import as_exact, bounded_costs, largest_cost, standing_out
+from factorsfm.motion.moving import as_exact, bounded_costs, largest_cost, moving_together, standing_out
 from factorsfm.polish.camera_starts import best_solution
 from factorsfm.support.options import Options, PolishOptions
 from factorsfm.tracks.flow import _moves_otherwise
@@ -82,6 +82,28 @@ def test_tracks_that_slide_are_kept():
     found = best_solution(problem.truth, seen, Options())
     assert standing_out(found.adjustment).sum() >= 8
     assert (len(found.kept), found.moving) == (len(problem.points), 0)
+
+
+@pytest.mark.parametrize(("count", "known"), [(120, 0), (24, 12), (8, 8)])
+def test_a_walker_is_a_thing_and_tracks_that_slide_are_none(count, known):
+    """A few of its tracks among those of the scene, as if it were of glass, must be known."""
+    problem, scene, _ = with_walker(0.05, count)
+    o = problem.observations
+    slides = (np.arange(scene + count) % 8 == 0) & (np.arange(scene + count) < scene)
+    rng = np.random.default_rng(1)
+    way = rng.normal(0.0, 4.0, (len(slides), 2))[o.point] * np.sin(0.5 * o.frame[:, None])
+    seen = replace(o, pixels=o.pixels + slides[o.point, None] * way)
+    solved = BundleAdjustment(problem.truth, seen, PolishOptions(), ErrorModel(0.1))
+    core, left_out = np.flatnonzero(~slides[:scene]), np.arange(scene, scene + known)
+    moves = moving_together(seen, solved.reprojection_errors(), 0.1, rests_on=core, left_out=left_out)
+    assert moves[scene:].mean() > 0.9
+    assert moves[core].sum() == 0
+    assert moves[:scene].sum() <= 8  # that slide beside the walker
+    alone = BundleAdjustment(
+        problem.truth.of(np.arange(scene)), seen.of(np.arange(scene)), PolishOptions(), ErrorModel(0.1)
+    )
+    errors = alone.reprojection_errors()
+    assert not moving_together(alone.observations, errors, 0.1, rests_on=core, left_out=core[:0]).any()
 
 
 def test_few_points_do_no_harm():

@@ -5,15 +5,26 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from factorsfm.frames.frame import Frame
 from factorsfm.graph.keyframe_graph import KeyframeGraph
+from factorsfm.graph.process import GraphProcess
 from factorsfm.mapping.map_copy import MapCopy
 from factorsfm.mapping.map_update import update_map
+from factorsfm.mapping.mapper import Mapper
 from factorsfm.mapping.point_map import PointMap
 from factorsfm.motion.readings import solution_from
 from factorsfm.motion.turning import turning_groups
 from factorsfm.polish.camera_starts import best_solution
+from factorsfm.streaming.frame_update import frame_update
 from factorsfm.support.options import MapperOptions, Options, PolishOptions
-from tests.estimation_problems import angles_between, make_problem, mapped_images, perturbed, with_points
+from tests.estimation_problems import (
+    angles_between,
+    make_problem,
+    mapped_images,
+    perturbed,
+    tracks_at,
+    with_points,
+)
 
 SMALL_PX = 0.1
 
@@ -82,6 +93,23 @@ def test_a_young_map_begins_again_without_the_body():
     assert update.committed
     assert not (update.ids >= scene).any()
     assert update.moving > 100
+    assert update.begins_again
     assert "move by themselves" in update.note
     turn = [angles_between(r[None], problem.truth.rotation[k][None])[0] for k, (r, _) in update.poses.items()]
     assert 1e-6 < problem.focal * max(turn) < 1.5
+
+
+def test_a_map_that_changes_its_mind_says_that_the_poses_before_are_void():
+    problem, _ = with_follower(120, 0.4, frames=30)
+    mapper = Mapper(GraphProcess(), problem.focal, 640, Options.preset_named("geometry"), has_prior=False)
+    updates = []
+    for k in range(8):
+        frame = Frame(k, np.zeros((360, 640, 3), np.uint8), f"{k:06d}", None)
+        image = mapper.add(tracks_at(k, *problem.of_frame(k)), lambda: None)
+        updates.append(frame_update(frame, image, mapper, [], focal_changed=False))
+        assert not mapper.starts_anew  # the graph goes on, with the factors of an IMU and of the caller
+    mapper.close()
+    first = next(update for update in updates if update.starts_anew)
+    assert first.index == 6
+    assert first.note == "120 tracks move by themselves, the map begins again without them"
+    assert all(update.starts_anew == bool(update.note) for update in updates)

@@ -32,13 +32,23 @@ class MovingPoints:
 
 
 def moving_points(
-    size: float = 0.7, noise_px: float = 0.05, *, prior: bool = True, prior_factor: float = 1.0, seed: int = 0
+    size: float = 0.7,
+    noise_px: float = 0.05,
+    *,
+    prior: bool = True,
+    prior_factor: float = 1.0,
+    rests: float = 0.0,
+    sway: float = 0.0,
+    drift: float = 0.0,
+    seed: int = 0,
 ) -> MovingPoints:
     """Tracks of points on three sides of a box at a distance of about 2.3.
 
     Args:
         size: of the box; noise_px: of the tracks.
         prior_factor: by how much nearer the prior says the object is than it is beside the scene.
+        rests: share of the time until the box begins to move, but for a `drift` to the right, units in the whole time.
+        sway: amplitude of the camera beside its steady way.
     """
     rng = np.random.default_rng(seed)
     camera = room_camera(480, 270)
@@ -46,10 +56,14 @@ def moving_points(
     points[np.arange(POINTS), rng.integers(0, 3, POINTS)] = -0.5
     points *= size
     poses, images, cameras = [], [], {}
-    for k, time in enumerate(np.linspace(0, 1, FRAMES)):
+    for k, elapsed in enumerate(np.linspace(0, 1, FRAMES)):
+        time = max(0.0, elapsed - rests) / (1.0 - rests)
         turn = pycolmap.Rotation3d(np.array([0.1, 0.7, -0.1]) * time + [0.3, 0.4, 0.0])
-        poses.append(pycolmap.Rigid3d(turn, np.array([0.8 * time - 0.4, 0.1 * time**2, 2.4 - 0.3 * time])))
-        cam_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.0, 0.05, 0.0]) * time), [-0.2 * time, 0, 0])
+        poses.append(
+            pycolmap.Rigid3d(turn, np.array([0.8 * time - 0.4 + drift * elapsed, 0.1 * time**2, 2.4 - 0.3 * time]))
+        )
+        way = np.array([-0.2 * elapsed, 0.0, 0.0]) + sway * np.sin([9.0 * elapsed, 14.0 * elapsed, 6.0 * elapsed])
+        cam_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.0, 0.05, 0.0]) * elapsed), way)
         in_camera = cam_from_world * (poses[-1] * points)
         pixels = camera.img_from_cam(in_camera) - 0.5 + noise_px * rng.standard_normal((POINTS, 2))
         inverse = prior_factor / in_camera[:, 2] * np.exp(0.02 * rng.standard_normal(POINTS)) + SHIFT

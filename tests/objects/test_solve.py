@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from factorsfm.objects.object_result import ObjectResult
 from factorsfm.objects.scale import PriorOnScene, scale_from_prior
-from factorsfm.objects.solve import SceneCamera, adjoint, solve_object
+from factorsfm.objects.smooth_errors import adjoint
+from factorsfm.objects.solve import SceneCamera, solve_object
 from factorsfm.support.errors import ReconstructionError
 from factorsfm.support.options import Options
 from tests.objects.moving_points import FRAME_STEP, FRAMES, POINTS, MovingPoints, moving_points
@@ -73,9 +74,34 @@ def test_scale_comes_from_the_prior_with_its_uncertainty() -> None:
     assert other / size == pytest.approx(1 / 1.25, rel=0.01)
 
 
+@pytest.mark.parametrize("sway", [0.03, 0.1])
+def test_a_rest_gives_the_scale_of_the_scene(sway: float) -> None:
+    """Whatever the prior says; as exactly as the tracks say where the thing is."""
+    moving = moving_points(prior_factor=1.4, rests=0.6, sway=sway)
+    found = solve_object("box", moving.images, COLORS, moving.cameras, Options())
+    assert found.scale_from == "rest"
+    assert found.scale_std is not None
+    assert 0.0004 < found.scale_std < 0.004
+    assert "It rests in the scene for 10 frames" in found.note
+    size, true_size = (np.linalg.norm(p - p.mean(0), axis=1).mean() for p in (found.points, moving.points))
+    assert abs(size / true_size - 1.0) < 3.0 * found.scale_std
+
+
+@pytest.mark.parametrize(
+    ("sway", "drift"),
+    [(0.0, 0.0), (0.0, 0.15), (0.02, 0.1), (0.1, 0.02), (0.1, 0.1)],
+    ids=["steady camera", "both steady", "sway hides no drift", "slow drift", "drift"],
+)
+def test_what_moves_with_the_camera_does_not_seem_to_rest(sway: float, drift: float) -> None:
+    """Beside a steady camera, what moves steadily looks like a rest in another scale."""
+    moving = moving_points(rests=0.6, sway=sway, drift=drift)
+    found = solve_object("box", moving.images, COLORS, moving.cameras, Options())
+    assert found.scale_from == "prior"
+
+
 def test_without_a_prior_the_scale_is_open_and_a_note_says_so() -> None:
     found = solved(prior=False)
-    assert found.scale_std is None
+    assert (found.scale_std, found.scale_from) == (None, None)
     assert "Nothing gives its scale" in found.note
     # At the scene's median depth, which is 4; up to that factor everything is as it is with the scale.
     first = truth().cameras[0].cam_from_world * found.frames[0].world_from_object.translation

@@ -13,6 +13,7 @@ from factorsfm.frames.reading import read_frames
 from factorsfm.report.overlay import Projector, draw_overlay, write_overlay
 from factorsfm.report.props import find_plane, place_props
 from factorsfm.report.result_folder import write_folder
+from factorsfm.result.moving import Moving, MovingStretch
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.support.errors import InputError
 from factorsfm.support.status import FrameStatus, ShotKind
@@ -188,6 +189,30 @@ def test_objects_are_drawn_where_they_belong() -> None:
                 for corners in project(pose, props.cubes):
                     cv2.fillConvexPoly(hull, np.round(cv2.convexHull(corners.astype(np.float32))).astype(int), 1)
                 assert not (changed & (cv2.dilate(hull, np.ones((7, 7))) == 0)).any()
+
+
+def test_what_moves_by_itself_has_a_colour_and_a_legend() -> None:
+    reconstruction = solved(floor_and_clutter())
+    props, project = place_props(reconstruction), Projector.of(reconstruction)
+    grey = np.full((270, 480, 3), 100, np.uint8)
+    places = np.array([[60.0, 40.0], [400.25, 200.5], [240.0, 100.0]])
+    stretches = (MovingStretch(0, 1, 0.1, 0.1),)
+    moving = Moving(stretches, np.array([0, 0, 1]), np.arange(3), places)
+    plain = draw_overlay(reconstruction, 0, grey, props, project, [])
+    marked = draw_overlay(replace(reconstruction, moving=moving), 0, grey, props, project, ["moving"])
+    changed = (marked != plain).any(axis=2)
+    legend = changed.copy()
+    legend[:200] = legend[:, 240:] = False
+    assert 300 < legend.sum() < 3000
+    crosses = changed & ~legend
+    v, u = np.nonzero(crosses)
+    distance = np.abs(np.stack([u, v], 1)[:, None] - places[:2]).max(axis=2)
+    assert distance.min(axis=1).max() <= 4
+    assert (np.bincount(distance.argmin(axis=1), minlength=2) > 6).all()
+    blue, green, red = marked[40, 60].astype(int)
+    assert min(blue, red) > green + 100
+    hidden = draw_overlay(replace(reconstruction, moving=moving), 0, grey, props, project, ["points", "grid"])
+    np.testing.assert_array_equal(hidden, draw_overlay(reconstruction, 0, grey, props, project, ["points", "grid"]))
 
 
 @pytest.mark.parametrize("suffix", [".avi", ".mp4", ".mov"])

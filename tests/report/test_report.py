@@ -14,6 +14,7 @@ import pytest
 from factorsfm.polish.observability import CameraObservability
 from factorsfm.report import Thumbnails, draw_picture, failure_html, report_html
 from factorsfm.report.wording import explanation, verdict_sentence
+from factorsfm.result.moving import Moving, MovingStretch
 from factorsfm.result.reconstruction import Reconstruction
 from factorsfm.result.summary import verdict
 from factorsfm.support.status import ShotKind
@@ -135,6 +136,19 @@ def test_tracks_carry_places_residuals_and_the_prior() -> None:
     prior = array(tracks["prior"], "<i2").reshape(5, 40)
     assert (prior[1] == -32768).all()
     np.testing.assert_allclose(prior[2] / tracks["prior_steps"], 0.15, atol=1e-4)
+
+
+def test_what_moves_by_itself_has_tracks_of_its_own() -> None:
+    xy = np.array([[10.0, 20.0], [11.0, 21.5], [630.0, 470.0]])
+    moving = Moving((MovingStretch(12, 18, 0.2, 0.125),), np.array([12, 14, 18]), np.array([0, 0, 1]), xy)
+    html = report_html(replace(build(), moving=moving))
+    data = embedded(html)["moving"]
+    assert data["start"] == [0, 0, 1, 2, 2, 3, 3]
+    np.testing.assert_array_equal(array(data["track"], "<u4"), [0, 0, 1])
+    np.testing.assert_allclose(array(data["place"], "<u2").reshape(-1, 2) / 65535 * [640, 480] - 0.5, xy, atol=0.01)
+    assert data["stretches"] == [[12, 18]]
+    assert "Moves by itself</dt><dd>up to 12 % of the image" in html
+    assert embedded(report_html(build()))["moving"] is None
 
 
 def test_views_are_seen_from_the_first_registered_camera() -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from factorsfm.report import Thumbnails, failure_html, report_html
+from factorsfm.result.moving import Moving, MovingStretch
 from factorsfm.result.reconstruction import Reconstruction
 from tests.exact_result import build
 from tests.report.chromium import EXECUTABLE, MISSING, Chromium
@@ -103,6 +104,22 @@ def with_thumbnails(reconstruction: Reconstruction) -> Reconstruction:
         thumbnails.add(image)
     thumbnails.attach(reconstruction.frames)
     return reconstruction
+
+
+def test_what_moves_by_itself_is_drawn_and_hidden(report: Report) -> None:
+    reconstruction = with_thumbnails(build())
+    report.open(report_html(reconstruction))
+    assert report.hidden("moving_control") == [True]
+    plain, strip = report.digest("footage"), report.digest("strip")
+    xy = np.random.default_rng(0).uniform([0.0, 0.0], [640.0, 480.0], (60, 2))
+    places = np.concatenate([xy, xy + 5.0])
+    moving = Moving((MovingStretch(10, 12, 0.5, 0.5),), np.repeat([10, 12], 60), np.tile(np.arange(60), 2), places)
+    report.open(report_html(replace(reconstruction, moving=moving)))
+    assert report.hidden("moving_control") == [False]
+    assert report.digest("strip") != strip
+    shown = report.digest("footage")
+    report.run("byId('show_moving').click()")
+    assert report.digest("footage") == plain != shown
 
 
 def test_everything_is_drawn(report: Report) -> None:

@@ -16,11 +16,13 @@ from hypothesis import strategies as st
 from factorsfm.cli.main import main
 from factorsfm.control.fit import ControlFit, ControlResidual
 from factorsfm.export import FORMATS, export
+from factorsfm.motion.stretches import Stretch
 from factorsfm.polish.observability import CameraObservability
 from factorsfm.report.result_folder import write_failure
 from factorsfm.result.reading import read_result
 from factorsfm.result.reconstruction import LensFit, RollingShutter
 from factorsfm.support.errors import InputError
+from factorsfm.support.status import ShotKind
 from tests.exact_result import build
 from tests.export_problems import hard_reconstruction
 
@@ -69,11 +71,13 @@ def test_what_is_known_of_lens_shutter_and_poses_comes_back(tmp_path: Path) -> N
     written.frames[1].observability = CameraObservability(float("nan"), float("nan"), 1.5, 0.25)
     written.frames[2].observability = CameraObservability(0.25, 0.5, 1.75, 0.125)
     written.frames[2].focal_std = 0.004
+    written.stretches = (Stretch(0, 1, ShotKind.STATIC), Stretch(2, 3, ShotKind.GENERAL))
     written.control = ControlFit(
         [ControlResidual("ground", "m", 0.01, 0.02, 0.5, contradicts=False)], ["000010"], ["sky"], True, 0.001, math.nan
     )
     written.write(tmp_path / "out")
     found = read_result(tmp_path / "out")
+    assert found.stretches == written.stretches
     assert found.lens == written.lens
     assert found.shutter == written.shutter
     assert repr(found.control) == repr(written.control)  # NaN differs from NaN

@@ -106,6 +106,43 @@ def test_uneven_times_are_noted():
     assert [frame.timestamp for frame in result.frames] == times.tolist()
 
 
+@pytest.fixture(scope="module")
+def in_bars() -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """The shot under bars of unlike height, and the part of it that is left."""
+    pictures = [image[36:150] for image in rendered("dolly").images]
+    return [cv2.copyMakeBorder(picture, 36, 30, 0, 0, cv2.BORDER_CONSTANT) for picture in pictures], pictures
+
+
+def test_bars_cost_nothing(in_bars):
+    shot, (barred, pictures) = rendered("dolly"), in_bars
+    cut = pycolmap.Camera(shot.camera.todict())
+    cut.height = len(pictures[0])
+    cut.params = [*shot.camera.params[:-1], shot.camera.params[-1] - 36]
+    _, expected = solved(pictures, cut)
+    _, result = solved(barred)
+    y = result.observation_xy[:, 1]
+    assert y.min() > 36 + 4
+    assert y.max() < 149 - 4
+    error, without = (np.sqrt(np.mean(errors_of(r, shot).ate ** 2)) for r in (result, expected))
+    assert error < 2 * without
+    assert (
+        "Black bars, 36 pixels above and 30 pixels below, are no part of the picture: nothing is tracked in them."
+        in (result.notes)
+    )
+
+
+def test_an_unknown_lens_is_that_of_the_picture(in_bars, tmp_path):
+    with Stream(options=QUICK) as stream:
+        for image in in_bars[0][:3]:
+            stream.push(image)
+        assert stream.camera.principal_point_y == pytest.approx(36 + 57, abs=2)
+        stream.save(tmp_path / "s")
+    with Stream.load(tmp_path / "s") as stream:
+        for image in in_bars[0][3:]:
+            stream.push(image)
+        assert stream.finish().notes[-1].startswith("Black bars, 36 pixels above")
+
+
 def squeezed(image: np.ndarray, factor: tuple[int, int]) -> np.ndarray:
     height, width = image.shape[:2]
     return cv2.resize(image, (width // factor[0], height // factor[1]), interpolation=cv2.INTER_AREA)

@@ -170,3 +170,13 @@ def test_images_without_features_are_empty(tmp_path: Path, shot: RenderedShot) -
     again = read_matches(tmp_path / "m.db", ["unknown.png"])
     assert len(again.keypoints[0]) == 0
     assert again.pairs == []
+
+
+def test_images_are_numbered_by_name_whatever_is_found_first(shot: RenderedShot, tmp_path: Path) -> None:
+    """Pairs are verified from the smaller number to the larger one: another order would give other matches."""
+    names = write_images(shot, tmp_path / "images")
+    runs = [match_images(tmp_path / f"{k}.db", tmp_path / "images", names, [shot.camera] * 3) for k in range(2)]
+    with pycolmap.Database.open(tmp_path / "0.db") as db:
+        assert [image.name for image in db.read_all_images()] == sorted(names)
+    for first, second in zip(*(run.pairs for run in runs), strict=True):
+        np.testing.assert_array_equal(first.rows, second.rows)

@@ -1,9 +1,21 @@
 """What is not determined counts as unobservable: no division by zero, no negative variance."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from factorsfm.adjustment.semidefinite import conditioned, covariance_of, solution, squared_deviations
+import factorsfm
+from factorsfm.support.semidefinite import (
+    conditioned,
+    covariance_and_root,
+    covariance_of,
+    deviations,
+    root_of,
+    solution,
+    squared_deviations,
+)
 
 
 def information_without(direction, scales):
@@ -39,7 +51,7 @@ def test_a_determined_system_is_solved_as_it_is():
     information = information_without(np.array([1.0, 1.0, 0.0]), np.ones(3)) + 0.1 * np.eye(3)
     gradient = np.array([1.0, -2.0, 3.0])
     np.testing.assert_array_equal(solution(information, gradient), np.linalg.solve(information, gradient))
-    np.testing.assert_array_equal(covariance_of(information), np.linalg.inv(information))
+    np.testing.assert_allclose(covariance_of(information), np.linalg.inv(information), rtol=1e-9)
 
 
 def test_evidence_from_few_samples_is_not_negative():
@@ -48,3 +60,36 @@ def test_evidence_from_few_samples_is_not_negative():
     along, across = samples[0], np.linalg.svd(samples)[2][3]
     assert squared_deviations(along, covariance) == pytest.approx(along @ np.linalg.pinv(covariance) @ along, rel=1e-5)
     assert squared_deviations(across, covariance) > 1e6
+
+
+def test_roots_are_those_of_the_matrix_whatever_is_open():
+    full = information_without(np.array([1.0, 1.0, 0.0]), np.ones(3)) + 0.1 * np.eye(3)
+    np.testing.assert_array_equal(root_of(full), np.linalg.cholesky(full))
+    singular = np.array([[2.0, 2.0, 0.0], [2.0, 2.0, 0.0], [0.0, 0.0, -1e-18]])
+    root = root_of(singular)
+    np.testing.assert_array_equal(np.triu(root, 1), 0.0)
+    np.testing.assert_allclose(root @ root.T, singular, atol=1e-11)
+    covariance, root = covariance_and_root(np.stack([full, np.diag([4.0, 0.0, 1.0])]))
+    np.testing.assert_allclose(covariance[0], np.linalg.inv(full))
+    np.testing.assert_allclose(covariance[1].diagonal(), [0.25, 1e12, 1.0])
+    np.testing.assert_allclose(root @ root.swapaxes(1, 2), covariance, rtol=1e-9, atol=1e-9)
+
+
+def test_what_is_no_number_is_not_known():
+    information = np.array([[4.0, np.nan], [np.nan, np.inf]])
+    np.testing.assert_allclose(covariance_of(information), np.diag([0.25, 1e12]))
+    np.testing.assert_array_equal(deviations(np.diag([4.0, -1e-9])), [2.0, 0.0])
+
+
+def test_normal_equations_are_solved_in_one_place():
+    """Elsewhere only matrices are inverted that no measurement can make singular."""
+    elsewhere = {
+        "report/props.py", "support/semidefinite.py", "synthetic/imu.py", "synthetic/room.py", "tracks/tiles.py"
+    }  # fmt: skip
+    package = Path(factorsfm.__file__).parent
+    found = {
+        file.relative_to(package).as_posix()
+        for file in package.rglob("*.py")
+        if re.search(r"linalg\.(solve|inv|cholesky)\(", file.read_text(encoding="utf-8"))
+    }
+    assert found == elsewhere
