@@ -20,7 +20,7 @@ from factorsfm.adjustment.noise import block_inflation
 from factorsfm.adjustment.observations import Observations, PriorObservations
 from factorsfm.adjustment.problem import NOTHING, POSES, CameraTerm, ErrorModel, Free, Known
 from factorsfm.adjustment.residuals import cauchy
-from factorsfm.adjustment.state import State
+from factorsfm.adjustment.state import LENS_SIZE, State
 from factorsfm.adjustment.track_term import TrackTerm
 from factorsfm.support.options import PolishOptions
 from factorsfm.support.rotations import exponential
@@ -75,7 +75,7 @@ class BundleAdjustment:
         self.free_optics = np.nonzero(estimated[self.columns.optics])[0]
         self._tracks = TrackTerm(
             state, observations, errors, options.kernel,
-            focal=free.focal, lens=known.lens is not None,
+            focal=free.focal, lens=np.zeros(LENS_SIZE, bool) if known.lens is None else known.lens.free,
         )  # fmt: skip
         self._depth = DepthTerm(prior, options.kernel) if prior is not None else None
         self._camera_terms: list[CameraTerm] = known.terms + ([AffinePrior(prior)] if prior is not None else [])
@@ -109,7 +109,7 @@ class BundleAdjustment:
 
     def reprojection_vectors(self) -> Array:
         """(m, 2) predicted minus observed position (pixels)."""
-        return self._tracks.residual(self.state)[0] * self.sigma
+        return self._tracks.residual(self.state) * self.sigma
 
     def cost(self) -> float:
         """Robust cost at the present state."""
@@ -129,7 +129,7 @@ class BundleAdjustment:
         each track keeps over a stretch (pixels)."""
         errors = self.errors.tracks
         if errors is None:
-            weight = cauchy(self._tracks.residual(self.state)[0], self.options.kernel)[1]
+            weight = cauchy(self._tracks.residual(self.state), self.options.kernel)[1]
             return self.sigma / np.sqrt(weight), np.zeros(len(self.state.bearing))
         return self.sigma / errors.root_weight, self.sigma / errors.sigma * errors.persistent
 
