@@ -19,7 +19,7 @@ Block = tuple[Array, Index, slice]
 # Rows of a frame, their columns, and the position of each entry among the columns; None: they are in order everywhere.
 Group = tuple[Index, Index, Index | None]
 # Flat positions of the values of columns of which each row has its own, whether no two have the same one, and these
-# columns; then flat positions of the sums over each point of those that all rows share, its first row, and these columns.
+# columns; then of the sums over each point of those that all rows share, the point's first row, and these columns.
 Places = tuple[NDArray[np.intp], bool, Index, NDArray[np.intp], Index, Index]
 
 _CHUNK = 512  # points eliminated together

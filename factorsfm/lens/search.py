@@ -20,6 +20,9 @@ Array = NDArray[np.float64]
 _FIELDS_OF_VIEW = np.radians(np.geomspace(20.0, 100.0, 8))  # across the longer side of the area that the tracks fill
 _ITERATIONS, _PARABOLAS, _TOLERANCE = 15, 3, 1e-3
 _CLEARLY = 0.9  # of the cost of another lens, below which one is preferred to it
+# Of the cost of the guess: with less of it, the cameras are solved through what is found. A twelfth more of the cost
+# makes errors so alike among neighbours that the reading of the shot would be doubted, not the lens.
+_BETTER = 0.98
 _BENDS = 0.95  # of the cost without distortion: with less of it, some beside the best lens asks for a search with it
 # Powers of the focal length with which a shape displaces the same pixels as far.
 _SHAPE_POWERS = np.array([2.0, 4.0, -1.0, -1.0, 0.0, 0.0])
@@ -31,13 +34,13 @@ class FoundLens:
 
     Attributes:
         guess: where the search started.
-        straight: without free distortion; clear: whether a few frames fit it clearly better than the guess.
+        straight: without free distortion; better: whether a few frames fit it better than the guess.
         bent: with free distortion, where that fits clearly better still.
     """
 
     guess: Lens
     straight: Lens
-    clear: bool
+    better: bool
     bent: Lens | None
 
 
@@ -49,11 +52,11 @@ def found_lens(adjustment: BundleAdjustment, options: PolishOptions, sigmas: Arr
     """
     guess = Lens.of(adjustment.state)
     straight, cost = search_lens(adjustment, options)
-    clear, bent = cost < _CLEARLY * on_some_frames(adjustment).cost(), None
+    better, bent = cost < _BETTER * on_some_frames(adjustment).cost(), None
     if sigmas[DISTORTION].any() and _bends(straight, cost, adjustment, options, sigmas):
         state, bent_cost = search_lens(adjustment, options, sigmas)
         bent = Lens.of(state) if bent_cost < _CLEARLY * cost else None
-    return FoundLens(guess, Lens.of(straight), clear, bent)
+    return FoundLens(guess, Lens.of(straight), better, bent)
 
 
 def _bends(straight: State, cost: float, adjustment: BundleAdjustment, options: PolishOptions, sigmas: Array) -> bool:

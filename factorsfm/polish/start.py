@@ -120,7 +120,7 @@ def _solved_core(shot: Shot, frames: list[int], observations: Observations, trac
     if found is None:
         if options.refine_focal_length and options.lens != "zoom":
             search = _searched(guess, few, options)
-            guess = through(guess, search.straight.focal) if search.clear else guess
+            guess = through(guess, search.straight.focal) if search.better else guess
         found = unless_at_rest(best_solution(guess, few, options), guess, few, options)
     adjustment, few = found.adjustment, found.adjustment.observations
     motion, lens, shutter, zoom = None, None, None, None
