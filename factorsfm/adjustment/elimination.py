@@ -180,8 +180,11 @@ class Elimination:
             for t, (position, single, own, of_sums, first, common) in zip(normal.terms, flat, strict=True):
                 rows = slice(*np.searchsorted(t.point, [span.start, span.stop]))
                 by_camera, by_point = t.by_camera[:, :, rows], t.decorrelated_by_point[:, :, rows]
-                values = np.einsum("cdm,pdm->cpm", by_camera[own], by_point).ravel()
-                if single:
+                by_own = by_camera[own] if len(common) else by_camera
+                values = np.einsum("cdm,pdm->cpm", by_own, by_point).ravel()
+                if single and t is normal.terms[0]:
+                    cross[position] = values
+                elif single:
                     cross[position] += values
                 else:
                     cross += np.bincount(position, values, len(cross))

@@ -18,7 +18,8 @@ from factorsfm.support.options import PolishOptions
 Array = NDArray[np.float64]
 
 _FIELDS_OF_VIEW = np.radians(np.geomspace(20.0, 100.0, 8))  # across the longer side of the area that the tracks fill
-_ITERATIONS, _PARABOLAS, _TOLERANCE = 15, 3, 1e-3
+_ITERATIONS, _PARABOLAS = 15, 3
+_ROUGH, _TOLERANCE = 1e-2, 1e-3  # relative decrease of the cost: of candidates, and where their best is looked for
 _CLEARLY = 0.9  # of the cost of another lens, below which one is preferred to it
 # Of the cost of the guess: with less of it, the cameras are solved through what is found. A twelfth more of the cost
 # makes errors so alike among neighbours that the reading of the shot would be doubted, not the lens.
@@ -82,16 +83,16 @@ def search_lens(
     """
     guess = Lens.of(adjustment.state)
     _, state, few = some_frames(adjustment.state, adjustment.observations)
-    options = replace(options, iterations=_ITERATIONS, tolerance=_TOLERANCE)
     known = Known(lens=None if sigmas is None else LensPrior(guess.shape, sigmas))
 
-    def fit(near: State, factor: float) -> tuple[float, State]:
+    def fit(near: State, factor: float, tolerance: float = _ROUGH) -> tuple[float, State]:
         focal = factor * guess.focal
         ratio = float(focal[0] / np.exp(near.log_focal[0])) if sigmas is not None else 1.0
         start = replace(through(near, focal), lens=near.lens * ratio**_SHAPE_POWERS)  # the same pixels move as far
         if not np.isfinite(start.normalized(few)).all():  # the lens has no ray for some pixels
             return np.inf, near
-        problem = BundleAdjustment(start, few, options, ErrorModel(adjustment.sigma), known=known)
+        solver = replace(options, iterations=_ITERATIONS, tolerance=tolerance)
+        problem = BundleAdjustment(start, few, solver, ErrorModel(adjustment.sigma), known=known)
         problem.solve()
         return problem.cost(), problem.state
 
@@ -113,7 +114,7 @@ def search_lens(
         x = np.log(np.array(around) / around[1])
         curvature, slope, _ = np.polyfit(x, costs, 2)
         factor = around[1] * float(np.exp(np.clip(-0.5 * slope / curvature, 0.5 * x[0], 0.5 * x[2])))
-        fits[factor] = fit(fits[around[1]][1], factor)
+        fits[factor] = fit(fits[around[1]][1], factor, _TOLERANCE)
     factor = min(fits, key=lambda f: fits[f][0])
     cost, found = fits[factor]
     return found, cost
