@@ -8,20 +8,19 @@ Points are unit bearings with an inverse distance, in which small motion is almo
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.adjustment.columns import Columns
 from factorsfm.adjustment.depth_term import AffinePrior, DepthTerm
 from factorsfm.adjustment.elimination import Block, Elimination, Normal, Term, reduced
+from factorsfm.adjustment.left_out import LeftOut
 from factorsfm.adjustment.marginals import Marginals, tangent_basis
 from factorsfm.adjustment.noise import block_inflation
 from factorsfm.adjustment.observations import Observations, PriorObservations
 from factorsfm.adjustment.problem import NOTHING, POSES, CameraTerm, ErrorModel, Free, Known
 from factorsfm.adjustment.residuals import cauchy
-from factorsfm.adjustment.state import State
+from factorsfm.adjustment.state import LENS_SIZE, State
 from factorsfm.adjustment.track_term import TrackTerm
 from factorsfm.support.options import PolishOptions
 from factorsfm.support.rotations import exponential
@@ -76,7 +75,7 @@ class BundleAdjustment:
         self.free_optics = np.nonzero(estimated[self.columns.optics])[0]
         self._tracks = TrackTerm(
             state, observations, errors, options.kernel,
-            focal=free.focal, lens=known.lens is not None,
+            focal=free.focal, lens=np.zeros(LENS_SIZE, bool) if known.lens is None else known.lens.free,
         )  # fmt: skip
         self._depth = DepthTerm(prior, options.kernel) if prior is not None else None
         self._camera_terms: list[CameraTerm] = known.terms + ([AffinePrior(prior)] if prior is not None else [])
@@ -110,7 +109,7 @@ class BundleAdjustment:
 
     def reprojection_vectors(self) -> Array:
         """(m, 2) predicted minus observed position (pixels)."""
-        return self._tracks.residual(self.state)[0] * self.sigma
+        return self._tracks.residual(self.state) * self.sigma
 
     def cost(self) -> float:
         """Robust cost at the present state."""
@@ -130,7 +129,7 @@ class BundleAdjustment:
         each track keeps over a stretch (pixels)."""
         errors = self.errors.tracks
         if errors is None:
-            weight = cauchy(self._tracks.residual(self.state)[0], self.options.kernel)[1]
+            weight = cauchy(self._tracks.residual(self.state), self.options.kernel)[1]
             return self.sigma / np.sqrt(weight), np.zeros(len(self.state.bearing))
         return self.sigma / errors.root_weight, self.sigma / errors.sigma * errors.persistent
 
@@ -158,27 +157,24 @@ class BundleAdjustment:
             term.add(s, normal.camera, normal.camera_gradient)
         return normal
 
-    def of(self, rows: NDArray[np.bool_]) -> BundleAdjustment:
-        """The tracks alone, with some of their observations, where two of a point are left."""
-        o = self.observations
-        rows = rows & (np.bincount(o.point, rows)[o.point] >= 2)
-        points, point = np.unique(o.point[rows], return_inverse=True)
-        part = BundleAdjustment(
-            self.state.of(points), o.at(rows, point=point), self.options, ErrorModel(self.sigma),
-            free=self.free, known=replace(self.known, control=None),
-        )  # fmt: skip
-        part._anchor, part._point_sigma = self._anchor[points], self._point_sigma
-        return part
-
     # --- solving ------------------------------------------------------------------------------------------------
 
     def lens_step(self) -> Array:
         """By how much a Newton step moves what is free of log focal lengths and shape; 0 of what nothing is seen."""
-        information, gradient = self.condensed()
-        seen = information.diagonal() > 1e-100
-        step = np.zeros(len(gradient))
-        step[seen] = -solution(information[np.ix_(seen, seen)], gradient[seen])
-        return np.asarray(step[np.searchsorted(self._free, self.columns.optics.start + self.free_optics)])
+        normal = self._linearize()
+        return self._lens_step(*reduced(normal, self._elimination.cross_blocks(normal), 0.0)[:2])
+
+    def lens_steps_without(self, part: Index) -> Array:
+        """(parts, c) as `lens_step`, of the tracks without each part of their observations; `part`: (m,) of each."""
+        normal = self._linearize()
+        rest = LeftOut(normal, self._elimination.cross_blocks(normal))
+        return np.array([self._lens_step(*rest.without(part == left_out)) for left_out in np.unique(part)])
+
+    def _lens_step(self, information: Array, gradient: Array) -> Array:
+        free = self._free[information.diagonal()[self._free] > 1e-100]
+        step = np.zeros(self.columns.size)
+        step[free] = -solution(conditioned(information[np.ix_(free, free)]), gradient[free])
+        return step[self.columns.optics][self.free_optics]
 
     def condensed(self) -> tuple[Array, Array]:
         """Information matrix and gradient of the free camera side at the present state, the points eliminated."""

@@ -18,8 +18,9 @@ Index = NDArray[np.int64]
 Block = tuple[Array, Index, slice]
 # Rows of a frame, their columns, and the position of each entry among the columns; None: they are in order everywhere.
 Group = tuple[Index, Index, Index | None]
-# Flat positions of values, and whether no two have the same one.
-Places = tuple[NDArray[np.intp], bool]
+# Flat positions of the values of columns of which each row has its own, whether no two have the same one, and these
+# columns; then of the sums over each point of those that all rows share, the point's first row, and these columns.
+Places = tuple[NDArray[np.intp], bool, Index, NDArray[np.intp], Index, Index]
 
 _CHUNK = 512  # points eliminated together
 _ROWS = 16  # of a block worked on at once: they stay in the processor's cache
@@ -139,13 +140,28 @@ class Elimination:
                 end = min(n, begin + _CHUNK)
                 rows = [slice(*np.searchsorted(t.point, [begin, end])) for t in terms]
                 columns, locals_ = self._occurring(*(t.columns[r] for t, r in zip(terms, rows, strict=True)))
-                flat = []
-                for t, r, local in zip(terms, rows, locals_, strict=True):
-                    position = local.T[:, None] * 3 * (end - begin) + 3 * (t.point[r] - begin)
-                    position = (position + np.arange(3)[:, None]).ravel()
-                    flat.append((position, np.bincount(position, minlength=1).max() <= 1))
+                flat = [
+                    self._places(t.columns[r], local.T[:, None] * 3 * (end - begin), t.point[r] - begin)
+                    for t, r, local in zip(terms, rows, locals_, strict=True)
+                ]
                 self._chunks.append((flat, columns, slice(begin, end)))
         return self._chunks
+
+    def _places(self, columns: Index, begin: Index, point: Index) -> Places:
+        """Places in a chunk of values of the columns (m, k); `begin`: (k, 1, m) of each, `point`: (m,)."""
+        position = begin + 3 * point + np.arange(3)[:, None]
+        common = (columns == columns[:1]).all(0)
+        _, first = np.unique(point, return_index=True)
+        own, sums = np.flatnonzero(~common), np.flatnonzero(common)
+        flat = position[own].ravel()
+        return (
+            flat,
+            bool(np.bincount(flat, minlength=1).max() <= 1),
+            own,
+            position[sums][:, :, first].ravel(),
+            first,
+            sums,
+        )
 
     def _occurring(self, *columns: Index) -> tuple[Index, list[Index]]:
         """The columns that occur (ascending), and where among them each of the given ones is."""
@@ -161,14 +177,20 @@ class Elimination:
         for flat, columns, span in self._chunk_indices(normal.terms):
             n = span.stop - span.start
             cross = np.zeros(len(columns) * 3 * n)
-            for t, (position, single) in zip(normal.terms, flat, strict=True):
+            for t, (position, single, own, of_sums, first, common) in zip(normal.terms, flat, strict=True):
                 rows = slice(*np.searchsorted(t.point, [span.start, span.stop]))
-                by_point = t.decorrelated_by_point[:, :, rows]
-                values = np.einsum("cdm,pdm->cpm", t.by_camera[:, :, rows], by_point).ravel()
-                if single:
+                by_camera, by_point = t.by_camera[:, :, rows], t.decorrelated_by_point[:, :, rows]
+                by_own = by_camera[own] if len(common) else by_camera
+                values = np.einsum("cdm,pdm->cpm", by_own, by_point).ravel()
+                if single and t is normal.terms[0]:
+                    cross[position] = values
+                elif single:
                     cross[position] += values
                 else:
                     cross += np.bincount(position, values, len(cross))
+                if len(common) and len(first):
+                    values = np.einsum("cdm,pdm->cpm", by_camera[common], by_point)
+                    cross[of_sums] += np.add.reduceat(values, first, axis=2).ravel()
             blocks.append((cross.reshape(len(columns), 3 * n), columns, span))
         return blocks
 

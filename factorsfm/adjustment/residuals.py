@@ -28,10 +28,16 @@ def by_pose(by_q: Array, q: Array, w: Array) -> Array:
     Returns:
         (..., n, 6).
     """
-    gx, gy, gz = np.moveaxis(by_q, -1, 0)
-    x, y, z = q.T
-    turn = [gy * z - gz * y, gz * x - gx * z, gx * y - gy * x]
-    return np.stack([*turn, -w * gx, -w * gy, -w * gz], -1)
+    return np.moveaxis(by_pose_rows(np.moveaxis(by_q, -1, 0), q.T, w), 0, -1)
+
+
+def by_pose_rows(by_q: Array, q: Array, w: Array) -> Array:
+    """As `by_pose`, components first: (3, ..., n), (3, n) and (n,) give (6, ..., n)."""
+    (gx, gy, gz), (x, y, z) = by_q, q
+    chained = np.empty((6, *by_q.shape[1:]))
+    chained[0], chained[1], chained[2] = gy * z - gz * y, gz * x - gx * z, gx * y - gy * x
+    np.multiply(-w, by_q, out=chained[3:])
+    return chained
 
 
 def reprojection(q: Array, observed: Array, focal: Array | float, lens: Array | None = None) -> tuple[Array, Array]:
@@ -39,21 +45,36 @@ def reprojection(q: Array, observed: Array, focal: Array | float, lens: Array | 
 
     Args:
         q: (n, 3); observed: (n, 2) pixels relative to the principal point; focal: pixels, one or (n,).
-        lens: as in `distort`; None: nothing is distorted.
+        lens: as in `distorted_rows`; None: nothing is distorted.
 
     Returns:
         Residual (n, 2) in pixels and its derivative by `q` (n, 2, 3).
     """
-    inverse = 1.0 / q[:, 2]
-    gain = focal * inverse
-    projected = q[:, :2] * gain[:, None]
-    by_q = np.zeros((len(q), 2, 3))
-    by_q[:, 0, 0] = by_q[:, 1, 1] = gain
-    by_q[:, :, 2] = -projected * inverse[:, None]
-    if lens is not None:
-        uv, by_uv, _ = distort(q[:, :2] * inverse[:, None], lens)
-        projected, by_q = np.reshape(focal, (-1, 1)) * uv, by_uv @ by_q
-    return projected - observed, by_q
+    projected, by_q = projected_rows(q.T, focal, lens)
+    return projected.T - observed, by_q.transpose(2, 1, 0)
+
+
+def projected_rows(q: Array, focal: Array | float, lens: Array | None = None) -> tuple[Array, Array]:
+    """The prediction of `reprojection` and its derivative by `q`, all components rows of their own.
+
+    Args:
+        q: (3, n); focal, lens: as in `reprojection`.
+
+    Returns:
+        (2, n) pixels relative to the principal point, and (3, 2, n).
+    """
+    inverse = 1.0 / q[2]
+    uv, gain = q[:2] * inverse, focal * inverse
+    by_q = np.zeros((3, 2, q.shape[1]))
+    if lens is None:
+        by_q[0, 0] = by_q[1, 1] = gain
+        np.multiply(-gain, uv, out=by_q[2])
+        return focal * uv, by_q
+    distorted, by_uv = distorted_rows(uv, lens)
+    by_q[0, 0], by_q[0, 1], by_q[1, 1] = gain * by_uv
+    by_q[1, 0] = by_q[0, 1]
+    by_q[2] = -(by_q[0] * uv[0] + by_q[1] * uv[1])
+    return focal * distorted, by_q
 
 
 def projection_by_pose(q: Array, focal: float) -> tuple[Array, Array]:
@@ -79,30 +100,51 @@ def projection_by_pose(q: Array, focal: float) -> tuple[Array, Array]:
 
 
 def distort(uv: Array, lens: Array) -> tuple[Array, Array, Array]:
+    """`distorted_rows` of points (n, 2), their derivative by `uv` (n, 2, 2) and by `lens` (n, 2, 4)."""
+    distorted, by_uv = distorted_rows(uv.T, lens)
+    xx, xy, yy = by_uv
+    return distorted.T, np.array([[xx, xy], [xy, yy]]).transpose(2, 0, 1), by_lens_rows(uv.T).transpose(2, 1, 0)
+
+
+def distorted_rows(uv: Array, lens: Array) -> tuple[Array, Array]:
     """``u (1 + k1 r^2 + k2 r^4) + c``: radial distortion as COLMAP's RADIAL model has it, and a principal point.
 
     Beyond 63 degrees off the axis the displacement stays constant: wrong matches that are predicted far outside of the
     image would otherwise decide the distortion.
 
     Args:
-        uv: (n, 2) undistorted normalised image coordinates.
+        uv: (2, n) undistorted normalised image coordinates.
         lens: (4,) k1, k2, and the principal point's displacement in focal lengths; what follows is of no concern here.
 
     Returns:
-        (n, 2) distorted coordinates, their derivative by `uv` (n, 2, 2) and by `lens` (n, 2, 4).
+        (2, n) distorted coordinates, and the elements xx, xy = yx and yy (3, n) of their derivative by `uv`.
     """
-    k1, k2, *center = lens[:4]
-    square = np.einsum("ni,ni->n", uv, uv)[:, None]
-    radius = np.sqrt(np.maximum(square, _REACH**2))  # of those beyond
-    outside, square, share = square > _REACH**2, np.minimum(square, _REACH**2), _REACH / radius
+    k1, k2, *center = lens[:4].tolist()
+    (u, v), (square, share) = uv, _within_reach(uv)
     bend = share * square * (k1 + square * k2)
-    gain = 1.0 + bend
-    by_uv = np.einsum("ni,nj->nij", uv * np.where(outside, -bend / radius**2, 2.0 * k1 + 4.0 * k2 * square), uv)
-    by_uv[:, [0, 1], [0, 1]] += gain
-    by_lens = np.zeros((len(uv), 2, 4))
-    by_lens[:, :, 0], by_lens[:, :, 1] = uv * share * square, uv * share * square**2
-    by_lens[:, [0, 1], [2, 3]] = 1.0
-    return uv * gain + center, by_uv, by_lens
+    change = np.where(share < 1.0, -bend * share**2 / _REACH**2, 2.0 * k1 + 4.0 * k2 * square)
+    gain, pull = 1.0 + bend, change * u
+    distorted = np.stack([u * gain + center[0], v * gain + center[1]])
+    return distorted, np.stack([pull * u + gain, pull * v, change * v * v + gain])
+
+
+def by_lens_rows(uv: Array) -> Array:
+    """(4, 2, n) derivative of `distorted_rows` by the lens, on which it does not depend."""
+    square, share = _within_reach(uv)
+    by_lens = np.zeros((4, 2, uv.shape[1]))
+    by_lens[0] = uv * (share * square)
+    by_lens[1] = by_lens[0] * square
+    by_lens[2, 0] = by_lens[3, 1] = 1.0
+    return by_lens
+
+
+def _within_reach(uv: Array) -> tuple[Array, Array]:
+    """(n,) squared distances from the axis, `_REACH` for those beyond it, and their share of the distance, else 1."""
+    square = uv[0] ** 2 + uv[1] ** 2
+    beyond = square > _REACH**2
+    if not beyond.any():
+        return square, np.ones_like(square)
+    return np.where(beyond, _REACH**2, square), np.where(beyond, _REACH / np.sqrt(np.maximum(square, _REACH**2)), 1.0)
 
 
 def undistort(uv: Array, lens: Array) -> Array:

@@ -75,6 +75,6 @@ def _left_out_covariance(adjustment: BundleAdjustment) -> Array:
     across, down, stretches = _LEFT_OUT
     time = o.frame * stretches // (int(o.frame.max()) + 1)
     part = time * across * down + image_cells(adjustment.state.normalized(o), across, down)
-    steps = np.array([adjustment.of(part != left_out).lens_step() for left_out in np.unique(part)])
+    steps = adjustment.lens_steps_without(part)
     steps -= steps.mean(0)
     return np.asarray(steps.T @ steps * ((len(steps) - 1) / len(steps)))

@@ -14,17 +14,16 @@ from factorsfm.adjustment.problem import ErrorModel, FocalPrior
 from factorsfm.adjustment.residuals import distort
 from factorsfm.adjustment.state import LENS_SIZE, State
 from factorsfm.lens.certainty import lens_deviations
-from factorsfm.lens.lens import READOUT_SIGMA, Lens, LensEstimate, shape_sigmas, through
-from factorsfm.lens.search import search_lens
+from factorsfm.lens.lens import READOUT_SIGMA, Lens, LensEstimate, observed_width, shape_sigmas, through
+from factorsfm.lens.search import FoundLens, found_lens
 from factorsfm.lens.solver import LensSolver, NotInvertibleError
 from factorsfm.motion.shot_kind import classify_motion
-from factorsfm.support.options import DETERMINED_FOCAL_STD, GIVEN_FOCAL_STD, LensFreedom, Options, PolishOptions
+from factorsfm.support.options import DETERMINED_FOCAL_STD, GIVEN_FOCAL_STD, LensFreedom, Options
 
 Array = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
 
-_CLEARLY = 0.9  # of the cost without distortion, at which the shot asks for some
 _TOLERANCE = 1e-5  # the focal length lies along a flat valley
 _OPEN_FOCAL_STD = 0.02  # like `DETERMINED_FOCAL_STD`, where a distortion that is not believed is part of it
 _HELD_STD = 1e-6  # relative, of a focal length that is known
@@ -78,30 +77,38 @@ def estimate_lens(
     focal_prior: FocalPrior | None = None,
     first_focal: tuple[Array, float] | None = None,
     *,
+    search: FoundLens | None = None,
     moves: bool = True,
 ) -> tuple[BundleAdjustment, LensEstimate]:
     """The lens where the shot determines it, else the first guess; and the cameras solved with it.
 
     Args:
-        adjustment: converged with the guess; focal_prior: of the focal lengths, None for none.
+        adjustment: converged with the guess, or with what the search found; focal_prior: of the focal lengths, None
+            for none.
         first_focal: (g,) focal lengths as they were known first, pixels, and their relative standard deviation; None:
             those of the guess, which are kept where the shot determines none.
+        search: where to start, None to search where it is needed.
         moves: whether the camera may; one that only turns has found its focal length already (`turning_camera`), and
             a translation would only bend it.
     """
-    guess, width = Lens.of(adjustment.state), _width(adjustment)
+    guess, width = Lens.of(adjustment.state), observed_width(adjustment.state, adjustment.observations)
+    if search is not None:
+        guess = replace(guess, focal=search.guess.focal)
     straight_sigmas, sigmas = _prior_sigmas(guess, options.lens, width)
     held = not options.refine_focal_length
     if held:
         focal_prior = FocalPrior(np.log(guess.focal), np.eye(len(guess.focal)) / _HELD_STD**2)
     o = replace(options.polish, tolerance=_TOLERANCE)
-    first, bent = (guess, None) if held or not moves else _searched(adjustment, o, sigmas)
+    start, bent = adjustment.state, None
+    if moves and not held:
+        search = search or found_lens(adjustment, o, sigmas)
+        start, bent = through(start, search.straight.focal), search.bent
     solver = LensSolver(adjustment.observations, o, focal_prior)
-    start = _seen_through(adjustment.state, first)
     by_itself = start if moves else classify_motion(adjustment, options.polish).rotation_only
     best = straight = _straight_solution(solver, by_itself, adjustment.sigma, straight_sigmas, moves=moves)
     if sigmas[DISTORTION].any():
         # Strong distortion moves the valley of the focal length: a start without any does not lead there.
+        bent = bent and Lens(bent.focal, np.r_[bent.shape[DISTORTION], guess.shape[READOUT]])
         starts = [] if bent is None else [(_seen_through(adjustment.state, bent), adjustment.sigma, moves)]
         starts.append((straight.adjustment.state, straight.adjustment.sigma, straight.moves))
         free = _with_free_shape(solver, starts, sigmas)
@@ -114,24 +121,10 @@ def estimate_lens(
 # --- stages -----------------------------------------------------------------------------------------------------
 
 
-def _width(adjustment: BundleAdjustment) -> float:
-    """Of what the tracks fill, normalised."""
-    return float(np.ptp(adjustment.state.normalized(adjustment.observations), axis=0).max())
-
-
 def _prior_sigmas(guess: Lens, freedom: LensFreedom, width: float) -> tuple[Array, Array]:
     """(6,) prior standard deviations of the shape: without distortion, and with what the options leave free."""
     readout = np.where(guess.shape[READOUT] != 0.0, READOUT_SIGMA, 0.0)
     return np.r_[np.zeros(4), readout], np.r_[shape_sigmas(freedom, width), readout]
-
-
-def _searched(adjustment: BundleAdjustment, options: PolishOptions, sigmas: Array) -> tuple[Lens, Lens | None]:
-    """Where the estimate starts: a lens without free distortion, and one with it where it fits clearly better."""
-    first, cost = search_lens(adjustment, options)
-    if not sigmas[DISTORTION].any():
-        return first, None
-    bent, bent_cost = search_lens(adjustment, options, sigmas)
-    return first, bent if bent_cost < _CLEARLY * cost else None
 
 
 def _seen_through(state: State, lens: Lens) -> State:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.adjustment.observations import DISTORTION
+from factorsfm.adjustment.observations import DISTORTION, Observations
 from factorsfm.adjustment.state import LENS_SIZE, State
 from factorsfm.support.options import LensFreedom
 
@@ -75,6 +75,11 @@ def shape_sigmas(freedom: LensFreedom, width: float) -> Array:
     distortion = 0.0 if freedom in ("auto", "fixed", "focal") else _DISTORTION_SIGMA
     center = _CENTER_SIGMA * width if freedom == "all" else 0.0
     return np.array([distortion, distortion, center, center])
+
+
+def observed_width(state: State, observations: Observations) -> float:
+    """Of what the tracks fill, normalised."""
+    return float(np.ptp(state.normalized(observations), axis=0).max())
 
 
 def through(state: State, focal: Array) -> State:

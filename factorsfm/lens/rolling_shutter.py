@@ -22,11 +22,12 @@ from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.observations import DISTORTION, READOUT, Observations, Sweep
 from factorsfm.adjustment.problem import ErrorModel, Free, Known, LensPrior
 from factorsfm.adjustment.residuals import by_pose, cauchy, reprojection
+from factorsfm.adjustment.some_frames import on_some_frames, some_frames
 from factorsfm.adjustment.state import State
 from factorsfm.lens.certainty import lens_deviations
-from factorsfm.lens.lens import READOUT_SIGMA, Lens, LensEstimate, shape_sigmas
+from factorsfm.lens.lens import READOUT_SIGMA, Lens, LensEstimate, observed_width, shape_sigmas
 from factorsfm.mapping.mapped_images import MappedImage
-from factorsfm.motion.shot_kind import LEAST_GAIN, Motion, translation_gain
+from factorsfm.motion.shot_kind import CLEAR_GAIN, LEAST_GAIN, Motion, translation_gain
 from factorsfm.support.options import Options
 from factorsfm.support.rotations import exponential
 from factorsfm.support.semidefinite import solution
@@ -172,8 +173,16 @@ def turns_before_shutter(adjustment: BundleAdjustment, motion: Motion, options: 
     """
     if motion.gain >= _TURNING_GAIN:
         return None
-    turning = _solved_with_readout(adjustment, motion.rotation_only, options, moves=False)
-    return turning if turning is not None and translation_gain(turning, adjustment) < LEAST_GAIN else None
+    _, few, _ = some_frames(motion.rotation_only, adjustment.observations)
+    if _turning(on_some_frames(adjustment), few, options, CLEAR_GAIN) is None:
+        return None
+    return _turning(adjustment, motion.rotation_only, options, LEAST_GAIN)
+
+
+def _turning(adjustment: BundleAdjustment, start: State, options: Options, least: float) -> BundleAdjustment | None:
+    """The camera that turns before a rolling shutter, None where it has none or where translation gains this much."""
+    turning = _solved_with_readout(adjustment, start, options, moves=False)
+    return turning if turning is not None and translation_gain(turning, adjustment) < least else None
 
 
 def _solved_with_readout(
@@ -181,7 +190,7 @@ def _solved_with_readout(
 ) -> BundleAdjustment | None:
     """Converged with a readout along rows or columns, None where it is short, or where the lens has no ray any more."""
     o = adjustment.observations
-    shape = shape_sigmas(options.lens, float(np.ptp(state.normalized(o), axis=0).max()))
+    shape = shape_sigmas(options.lens, observed_width(state, o))
 
     def problem(free: NDArray[np.bool_]) -> BundleAdjustment:
         return BundleAdjustment(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,12 +11,14 @@ from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.noise import coordinate_sigma
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import ErrorModel, FocalPrior, Free, Known, LensPrior
+from factorsfm.adjustment.some_frames import on_some_frames
 from factorsfm.adjustment.state import State
-from factorsfm.motion.shot_kind import LEAST_GAIN, classify_motion, translation_gain
+from factorsfm.motion.shot_kind import CLEAR_GAIN, LEAST_GAIN, classify_motion, translation_gain
 from factorsfm.support.options import PolishOptions
-from factorsfm.support.status import ShotKind
 
 Array = NDArray[np.float64]
+
+_TURNING_TOLERANCE = 1e-3  # a gain is compared, not a lens found
 
 
 class NotInvertibleError(Exception):
@@ -55,19 +57,27 @@ class LensSolver:
         if not moves:
             return best, False
         known_lens = BundleAdjustment(best.state, self.observations, self.options, best.errors)
-        motion = classify_motion(known_lens, self.options)
-        general = motion.kind is ShotKind.GENERAL
-        if general and sigmas.any():  # a lens may have bent to fit a false translation: let it do without
-            rotating = BundleAdjustment(
-                motion.rotation_only, self.observations, self.options, best.errors,
-                free=Free(translation=False, focal=True),
-                known=Known(self.focal_prior, LensPrior(motion.rotation_only.lens, sigmas)),
-            )  # fmt: skip
-            rotating.solve()
-            general = translation_gain(rotating, known_lens) > LEAST_GAIN
-        if general:
+        if self._turning(on_some_frames(known_lens), sigmas, CLEAR_GAIN) is None:
             return best, True
-        return self.solved(motion.rotation_only, best.sigma, sigmas, moves=False), False
+        turning = self._turning(known_lens, sigmas, LEAST_GAIN)
+        if turning is None:
+            return best, True
+        return self.solved(turning, best.sigma, sigmas, moves=False), False
+
+    def _turning(self, known_lens: BundleAdjustment, sigmas: Array, least: float) -> State | None:
+        """A camera that only turns, None where translation gains at least this much."""
+        motion = classify_motion(known_lens, self.options)
+        if motion.gain <= least:
+            return motion.rotation_only
+        if not sigmas.any():
+            return None
+        rotating = BundleAdjustment(  # a lens may have bent to fit a false translation: let it do without
+            motion.rotation_only, known_lens.observations, replace(self.options, tolerance=_TURNING_TOLERANCE),
+            known_lens.errors, free=Free(translation=False, focal=True),
+            known=Known(self.focal_prior, LensPrior(motion.rotation_only.lens, sigmas)),
+        )  # fmt: skip
+        rotating.solve()
+        return motion.rotation_only if translation_gain(rotating, known_lens) <= least else None
 
     def _problem(self, state: State, sigma: float, sigmas: Array, moves: bool) -> BundleAdjustment:
         check_invertible(state, self.observations)

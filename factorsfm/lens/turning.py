@@ -16,9 +16,9 @@ from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.noise import FIRST_SIGMA_PX, image_cells
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import ErrorModel, Free
+from factorsfm.adjustment.some_frames import some_frames
 from factorsfm.adjustment.state import State
 from factorsfm.lens.lens import through
-from factorsfm.lens.search import some_frames
 from factorsfm.support.options import PolishOptions
 
 Array = NDArray[np.float64]

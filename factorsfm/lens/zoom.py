@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import FocalPrior
+from factorsfm.adjustment.some_frames import some_frames
 from factorsfm.adjustment.state import LENS_SIZE, State
 from factorsfm.lens.certainty import lens_covariances
-from factorsfm.lens.search import some_frames
 from factorsfm.lens.solver import LensSolver, NotInvertibleError
 from factorsfm.motion.shot_kind import LEAST_GAIN, translation_gain
 from factorsfm.support.options import PolishOptions

@@ -21,6 +21,7 @@ _STATIC_SHARE = 0.004  # largest median displacement of the tracks of a static s
 # count as observed when they explain at least half as much again as noise. On tripod shots the gain is 0.05 to 0.15,
 # on the first ten frames of slow moves 1.5 and more.
 LEAST_GAIN = 0.5
+CLEAR_GAIN = 2.0 * LEAST_GAIN  # on few of the frames, at which all of them need not be asked
 _CLOSE = 1.5  # factor on it between which the verdict is doubtful
 
 

@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import FocalPrior, Free
+from factorsfm.adjustment.some_frames import some_frames
 from factorsfm.adjustment.state import State
 from factorsfm.lens.estimate import estimate_lens
-from factorsfm.lens.lens import LensEstimate
+from factorsfm.lens.lens import LensEstimate, observed_width, shape_sigmas, through
 from factorsfm.lens.rolling_shutter import Shutter, find_shutter
+from factorsfm.lens.search import FoundLens, found_lens
 from factorsfm.lens.zoom import Zoom, find_zoom, unannounced_zoom
 from factorsfm.mapping.all_points import triangulated, with_all_points
 from factorsfm.motion.at_rest import Rest
@@ -22,7 +24,7 @@ from factorsfm.motion.moving import center_and_spread, log_errors, moving_togeth
 from factorsfm.motion.readings import solution_from
 from factorsfm.motion.shot_kind import Motion, classify_motion
 from factorsfm.motion.suspects import agreeing
-from factorsfm.polish.camera_starts import best_solution, core_tracks, is_doubtful
+from factorsfm.polish.camera_starts import best_solution, core_tracks, is_doubtful, on_what_fits
 from factorsfm.polish.near_and_far import NearAndFar, near_and_far
 from factorsfm.polish.shot import Shot
 from factorsfm.polish.simple_readings import turning_reading, unless_at_rest
@@ -114,8 +116,11 @@ def _solved_core(shot: Shot, frames: list[int], observations: Observations, trac
     core = trusted[core_tracks(observations.of(trusted), len(frames))]
     few = observations.of(core)
     guess = _first_guess(shot, frames, few, tracks[core], _world(observations))
-    found = turning_reading(guess, few, options)
+    found, search = turning_reading(guess, few, options), None
     if found is None:
+        if options.refine_focal_length and options.lens != "zoom":
+            search = _searched(guess, few, options)
+            guess = through(guess, search.straight.focal) if search.better else guess
         found = unless_at_rest(best_solution(guess, few, options), guess, few, options)
     adjustment, few = found.adjustment, found.adjustment.observations
     motion, lens, shutter, zoom = None, None, None, None
@@ -125,7 +130,7 @@ def _solved_core(shot: Shot, frames: list[int], observations: Observations, trac
     if shutter is not None:
         adjustment = solution_from(replace(adjustment.state, lens=shutter.lens.shape), few, options.polish)
     if options.estimates_lens:
-        adjustment, lens, zoom = _estimate_lens(adjustment, shot, frames, options, moves=not found.turns)
+        adjustment, lens, zoom = _estimate_lens(adjustment, shot, frames, options, search, moves=not found.turns)
         shutter = shutter and shutter.known_with(lens)
     elif shot.in_time and is_doubtful(adjustment, options):
         zoom = unannounced_zoom(adjustment, adjustment, shot.times(frames), options.polish, doubtful=True)
@@ -176,11 +181,19 @@ def _world(observations: Observations) -> int:
     return int(np.argmax(count >= _MANY_TRACKS * count.max()))
 
 
+def _searched(guess: State, observations: Observations, options: Options) -> FoundLens:
+    """The lenses that few frames show, without what moves by itself there."""
+    solved = on_what_fits(*some_frames(guess, observations)[1:], options).adjustment
+    width = observed_width(solved.state, solved.observations)
+    return found_lens(solved, options.polish, np.r_[shape_sigmas(options.lens, width), np.zeros(2)])
+
+
 def _estimate_lens(
     adjustment: BundleAdjustment,
     shot: Shot,
     frames: list[int],
     options: Options,
+    search: FoundLens | None,
     *,
     moves: bool,
 ) -> tuple[BundleAdjustment, LensEstimate, Zoom | None]:
@@ -189,7 +202,8 @@ def _estimate_lens(
     if options.lens == "zoom" and len(adjustment.state.log_focal) == 1:
         zoom = find_zoom(adjustment, times, options.polish)
     if zoom is None or not zoom.found:
-        fixed, lens = estimate_lens(adjustment, options, first_focal=shot.first_focal, moves=moves)
+        first = shot.first_focal or (shot.guess.focal, 0.0)
+        fixed, lens = estimate_lens(adjustment, options, first_focal=first, search=search, moves=moves)
         if options.lens == "distortion" and shot.in_time and len(adjustment.state.log_focal) == 1:
             doubtful = is_doubtful(fixed, options)
             if moves or doubtful:

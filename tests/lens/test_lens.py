@@ -321,10 +321,10 @@ def test_the_search_sees_through_distortion_where_it_may():
     adjustment = BundleAdjustment(problem.truth, seen, PolishOptions(), ErrorModel(0.2))
     straight, cost = search_lens(adjustment, PolishOptions())
     bent, bent_cost = search_lens(adjustment, PolishOptions(), np.array([0.1, 0.1, 0.0, 0.0, 0.0, 0.0]))
-    assert not straight.shape.any()
+    assert not straight.lens.any()
     assert bent_cost < 0.5 * cost
     assert bent.focal[0] == pytest.approx(problem.focal, rel=0.1)
-    np.testing.assert_allclose(bent.shape, STRONG_BARREL, atol=0.1)
+    np.testing.assert_allclose(bent.lens, STRONG_BARREL, atol=0.1)
 
 
 def test_distortion_alone_is_recovered_and_the_focal_length_stays_as_given():
