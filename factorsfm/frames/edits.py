@@ -166,8 +166,7 @@ def find_shots(
 ) -> list[range]:
     """The shots of a video, each as the range of its frames; blank frames at either end are left out.
 
-    A step over frames that a recorder has dropped is no cut where both sides show nearly the same view. Beside shots of
-    more frames, a single one is none.
+    A step over frames that a recorder has dropped is no cut where both sides show nearly the same view.
 
     Args:
         source, frames, fields: as in `read_frames`; the ranges count frames of the source.
@@ -175,9 +174,7 @@ def find_shots(
     Raises:
         InputError: the source cannot be read.
     """
-    shots = _joined(by_shot(read_frames(source, frames, fields=fields), _Stretch, _Stretch.add))
-    longest = max(map(len, shots), default=0)
-    return [shot for shot in shots if len(shot) > 1 or longest == 1]
+    return _joined(by_shot(read_frames(source, frames, fields=fields), _Stretch, _Stretch.add))
 
 
 def _joined(stretches: Sequence[_Stretch]) -> list[range]:
