@@ -10,7 +10,8 @@ from factorsfm.camera.guess import guess_camera
 from factorsfm.control.fit import ControlFit, ControlResidual
 from factorsfm.control.known import Control, KnownDistance, KnownHeight, KnownPose, MarkedPoint, read_control
 from factorsfm.export.options import ExportOptions, UpAxis
-from factorsfm.frames.cuts import CutDetector, ShotUpdate, find_shots
+from factorsfm.frames.cuts import CutDetector, ShotUpdate
+from factorsfm.frames.edits import find_shots
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.live_sources import Source, open_source
 from factorsfm.frames.raw import RawFormat

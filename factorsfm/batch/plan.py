@@ -13,7 +13,7 @@ import pycolmap
 
 from factorsfm.batch.outcome import is_result_of
 from factorsfm.camera.files import camera_to_json
-from factorsfm.frames.cuts import find_shots
+from factorsfm.frames.edits import find_shots
 from factorsfm.frames.fields import Fields
 from factorsfm.frames.folders import list_files
 from factorsfm.frames.video import VIDEO_SUFFIXES

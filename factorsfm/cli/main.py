@@ -35,7 +35,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     command = _COMMANDS[arguments.command]
     terminal = sys.stderr.isatty()
     progress = ProgressLine(sys.stderr, enabled=terminal and not arguments.verbose)
-    log = _start_log(progress, arguments.verbose, at_once=terminal or arguments.verbose > 0 or command.followed)
+    lines = LogHandler(progress, all_alike=arguments.verbose > 0)
+    log = _start_log(lines, arguments.verbose, at_once=terminal or arguments.verbose > 0 or command.followed)
     try:
         with progress:
             said = command.run(arguments, progress)
@@ -54,13 +55,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _complain(f"error: {str(error) or 'not enough memory'}", BAD_INPUT)
     finally:
         log.flush()
+        lines.say_rest()
     return 0
 
 
-def _start_log(progress: ProgressLine, verbose: int, *, at_once: bool) -> MemoryHandler:
+def _start_log(lines: LogHandler, verbose: int, *, at_once: bool) -> MemoryHandler:
     """Log to stderr, at once or at the end; the end can drop the warnings, so that bad input is one line."""
     level = (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
-    log = MemoryHandler(_LOGGED, logging.DEBUG if at_once else logging.CRITICAL, LogHandler(progress))
+    log = MemoryHandler(_LOGGED, logging.DEBUG if at_once else logging.CRITICAL, lines)
     logging.basicConfig(level=level, handlers=[log])
     logging.captureWarnings(True)
     return log

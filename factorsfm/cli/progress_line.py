@@ -49,13 +49,37 @@ class ProgressLine(Closing):
 
 
 class LogHandler(logging.StreamHandler[TextIO]):
-    """Writes log lines to stderr; the line of progress gives way."""
+    """Writes log lines to stderr; the line of progress gives way.
 
-    def __init__(self, line: ProgressLine) -> None:
+    Args:
+        all_alike: show also the lines that say what others have said; else they are counted, and `say_rest` tells.
+    """
+
+    _MOST_ALIKE = 3  # lines from one place in the program: enough to see which files or frames it is about
+
+    def __init__(self, line: ProgressLine, *, all_alike: bool) -> None:
         super().__init__()
         self.setFormatter(logging.Formatter("%(levelname)s %(name)s: %(message)s"))
-        self._line = line
+        self._line, self._all = line, all_alike
+        self._shown: dict[tuple[str, int], set[str]] = {}  # texts, by logger and line of code
+        self._rest: dict[
+            tuple[str, int], tuple[logging.LogRecord, int]
+        ] = {}  # the last one that is not shown, how many
 
     def emit(self, record: logging.LogRecord) -> None:
+        if not self._all:
+            place, text = (record.name, record.lineno), record.getMessage()
+            shown = self._shown.setdefault(place, set())
+            if text in shown or len(shown) >= self._MOST_ALIKE:
+                self._rest[place] = record, self._rest.get(place, (record, 0))[1] + 1
+                return
+            shown.add(text)
         self._line.clear()
         super().emit(record)
+
+    def say_rest(self) -> None:
+        """How many lines were not shown, and the last one of each sort."""
+        for record, count in self._rest.values():
+            head = f"{record.levelname} {record.name}: {count} more"
+            self.stream.write(f"{head} like this: {record.getMessage()}\n")
+        self._rest.clear()

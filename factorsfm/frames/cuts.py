@@ -11,16 +11,13 @@ import statistics
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.frames.block_matching import Thumbnail, dissimilarity, dissolve_variances
-from factorsfm.frames.fields import Fields
 from factorsfm.frames.frame import Frame
-from factorsfm.frames.reading import read_frames
 from factorsfm.support.errors import InputError
 
 T = TypeVar("T")
@@ -231,21 +228,6 @@ class CutDetector:
         self._shot.recent.append(thumbnail)
         self._shots += 1
         return ShotUpdate(index, self._shot.number, True, difference, reason)
-
-
-def find_shots(
-    source: str | Path | Iterable[Frame | NDArray[np.uint8]], frames: slice | None = None, *, fields: Fields = "auto"
-) -> list[range]:
-    """The shots of a video, each as the range of its frames; blank frames at either end are left out.
-
-    Args:
-        source, frames, fields: as in `read_frames`; the ranges count frames of the source.
-
-    Raises:
-        InputError: the source cannot be read.
-    """
-    shots = by_shot(read_frames(source, frames, fields=fields), list[int], lambda shot, frame: shot.append(frame.index))
-    return [range(shot[0], shot[-1] + 1) for shot in shots]
 
 
 def by_shot(frames: Iterable[Frame], new: Callable[[], T], add: Callable[[T, Frame], None]) -> list[T]:

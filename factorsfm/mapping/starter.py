@@ -18,7 +18,8 @@ logger = logging.getLogger(__name__)
 
 _PAIR_WINDOW = 10  # images among which the paper's initial pair is sought
 NOT_JOINED = (FrameStatus.LOST, FrameStatus.TOO_FEW_INLIERS)
-_PATIENCE, _BARELY_STARTED = 5, 2  # images that do not join a map, and its keyframes, with which it is given up
+_PATIENCE = 5  # images that do not join a map, with which one is given up that has barely started:
+_FEW_KEYFRAMES, _FEW_JOINED = 2, 6  # it has so few keyframes, or a quarter of a second of images has joined it
 _LIFT_PATIENCE = 10  # images without a usable depth map after which the start does without
 
 
@@ -80,7 +81,7 @@ def _tracks(images: Sequence[MappedImage]) -> list[ImageTracks]:
 def passed_by(images: Sequence[MappedImage], keyframes: int, min_tracks: int) -> bool:
     """Whether more images have failed to join the map than ever joined it, and share tracks among themselves.
 
-    The map is of a flash then, or of the end of the shot before. One that has grown is never given up.
+    The map is of a flash then, of a whip pan, or of the end of the shot before. One that has grown is never given up.
 
     Args:
         images: in order of time; keyframes: number of those of the map.
@@ -89,6 +90,7 @@ def passed_by(images: Sequence[MappedImage], keyframes: int, min_tracks: int) ->
     joined = sum(image.registered for image in images)
     since = itertools.takewhile(lambda image: not image.registered, reversed(images))
     failed = [image.tracks for image in since if image.status in NOT_JOINED]
-    if keyframes > _BARELY_STARTED or len(failed) <= max(_PATIENCE, joined):
+    barely_started = keyframes <= _FEW_KEYFRAMES or joined <= _FEW_JOINED
+    if not barely_started or len(failed) <= max(_PATIENCE, joined):
         return False
     return shared_tracks(failed[0], failed[_PATIENCE]) >= min_tracks

@@ -60,16 +60,21 @@ def summary(reconstruction: Reconstruction) -> dict[str, Any]:
 def failure_summary(
     reason: str, frames: Sequence[FrameResult], options: Mapping[str, Any], seconds: Mapping[str, float]
 ) -> dict[str, Any]:
-    """The summary of a shot that cannot be reconstructed."""
+    """The summary of a shot that cannot be reconstructed: with the keys of any other, so that one reader fits both."""
+    numbers = ("parallax", "kind", "control", "imu", "reprojection_error", "observability", "focal_length")
     return {
         "program": PROGRAM,
         "version": program_version(),
         "reconstructed": False,
         "grade": Grade.NOT_SOLVED,
         "reason": reason,
+        "verdict": reason,
         "source": options.get("source"),
         "frames": len(frames),
         "registered": sum(frame.registered for frame in frames),
+        **dict.fromkeys(("keyframes", "points", "observations", "parts"), 0),
+        **dict.fromkeys((*numbers, "metric", "focal_range", "camera", "lens", "shutter")),
+        **{name: [] for name in ("doubts", "stretches", "moving", "objects", "notes")},
         "seconds": with_total(seconds),
         "statuses": [_frame_json(frame) for frame in frames],
         "options": options,

@@ -26,6 +26,7 @@ from factorsfm.streaming.footage import Footage
 from factorsfm.streaming.frame_update import SeenFrame
 from factorsfm.streaming.imu_result import add_imu
 from factorsfm.streaming.imu_source import FramePoses, ImuSource
+from factorsfm.streaming.lost_frames import lost_frames
 from factorsfm.support.errors import ReconstructionError
 from factorsfm.support.options import Options
 from factorsfm.support.progress import Progress
@@ -87,6 +88,8 @@ class EndedShot:
             interval=self.footage.interval(self.frames),
             options=self.options.to_dict(),
         )
+        if lost := lost_frames(result.frames, self.mapper.images):
+            result.notes.append(lost)
         if len(self.suspects):
             agree = int(np.isin(polished.tracks, self.suspects).sum())
             result.notes.append(

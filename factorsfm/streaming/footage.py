@@ -219,5 +219,4 @@ def _like_twin(twin: FrameResult, repeat: Repeat) -> FrameResult:
         repeats=twin.index,
         keyframe=False,
         relative_covariance=None,
-        observability=None,
     )

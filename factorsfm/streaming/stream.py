@@ -41,6 +41,7 @@ from factorsfm.streaming.frame_update import (
     pose_of,
 )
 from factorsfm.streaming.imu_source import ImuSource, restore_imu
+from factorsfm.streaming.lost_frames import with_large_steps
 from factorsfm.streaming.snapshot import read_snapshot, write_snapshot
 from factorsfm.streaming.suspicion import Suspicion
 from factorsfm.streaming.view_finder import ViewFinder
@@ -322,9 +323,11 @@ class Stream(Closing):
             try:
                 result = self._ended().reconstruction(progress)
             except ReconstructionError as error:
-                frames = frame_results(self.frames, self._mapper.images if self._mapper is not None else [])
+                images = self._mapper.images if self._mapper is not None else []
+                frames = frame_results(self.frames, images)
                 self._thumbnails.attach(frames)
-                raise ReconstructionError(str(error), self._footage.add_results(frames)) from error
+                reason = with_large_steps(str(error), frames, images)
+                raise ReconstructionError(reason, self._footage.add_results(frames)) from error
             self._thumbnails.attach(result.frames)
             self._footage.add_to(result)
             return result

@@ -12,6 +12,7 @@ import pytest
 from factorsfm.cli import demo
 from factorsfm.cli.main import main
 from factorsfm.evaluation.metrics import TrajectoryErrors
+from factorsfm.result.summary import summary as summary_of
 from factorsfm.support.errors import InputError, ReconstructionError
 from tests.exact_result import build
 
@@ -176,7 +177,8 @@ def test_a_shot_that_cannot_be_reconstructed_leaves_the_reason(
     assert_one_error_line(capsys.readouterr(), "12 tracks found, 30 needed")
     assert {p.name for p in out.iterdir()} == {"summary.json", "report.html"}
     summary = json.loads((out / "summary.json").read_text())
-    assert summary["reason"] == "12 tracks found, 30 needed"
+    assert summary["reason"] == summary["verdict"] == "12 tracks found, 30 needed"
+    assert summary.keys() >= summary_of(build()).keys()  # who reads one reads the other
     assert (summary["source"], summary["options"]["preset"]) == ("shot.mp4", "geometry")
 
 
@@ -226,6 +228,31 @@ def test_warnings_of_bad_input_do_not_stand_beside_its_line(
     said = capsys.readouterr().err
     assert said.startswith("factorsfm: error: no") or "WARNING factorsfm: a guess\n" in said
     assert ("a guess" in said) != isinstance(raised, InputError)
+
+
+@pytest.mark.parametrize(("flags", "lines"), [([], 6), (["-v"], 20)])
+def test_warnings_that_say_the_same_are_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], flags: list[str], lines: int
+) -> None:
+    """One text, and one sentence on ten files: the first three of a sort are shown, the last one with the rest."""
+
+    def reconstruct(*_: Any, **__: Any) -> Any:
+        for k in range(10):
+            logging.getLogger("factorsfm").warning("image %d.jpg is left out", k)
+            logging.getLogger("factorsfm.lens").warning("a guess")
+        return build()
+
+    monkeypatch.setattr("factorsfm.api.reconstruct", reconstruct)
+    logging.getLogger().handlers.clear()  # else logging is taken as configured
+    assert main(["reconstruct", "shot.mp4", "--output", str(tmp_path / "out"), *flags]) == 0
+    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("WARNING")]
+    assert len(said) == lines
+    assert said[0] == "WARNING factorsfm: image 0.jpg is left out"
+    if not flags:
+        assert set(said[-2:]) == {
+            "WARNING factorsfm: 7 more like this: image 9.jpg is left out",
+            "WARNING factorsfm.lens: 9 more like this: a guess",
+        }
 
 
 def test_interrupt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from factorsfm.frames.cuts import CutDetector, find_shots
+from factorsfm.frames.cuts import CutDetector
+from factorsfm.frames.edits import find_shots
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.reading import read_frames
 from factorsfm.support.errors import InputError

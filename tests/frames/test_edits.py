@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import factorsfm
-from factorsfm.frames.edits import AnotherView, read_edit, until_another_view
+from factorsfm.frames.edits import AnotherView, find_shots, read_edit, until_another_view
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.reading import read_frames
 from factorsfm.support.errors import ReconstructionError
@@ -79,6 +79,28 @@ def test_dropped_frames_are_no_cut_while_the_view_is_nearly_the_same(tmp_path, z
     with pytest.raises(AnotherView):  # the detector alone sees a cut
         list(until_another_view(Frame(k, image, str(k)) for k, image in enumerate(images)))
     assert len(found(tmp_path / "a", images)[0]) == shots
+
+
+def test_a_whip_pan_beside_a_shot_is_left_out(tmp_path):
+    """Six frames, each of which averages a pan over 200 pixels; as many sharp ones are a shot of their own."""
+    fine = np.random.default_rng(0).integers(0, 80, (HEIGHT, 2 * WIDTH, 3), np.uint8)
+    other, own = (scenery(seed)[100 : 100 + HEIGHT] // 2 + fine for seed in (1, 0))
+    whip = [
+        np.mean([other[:, x : x + WIDTH] for x in range(40 * k, 40 * k + 200, 2)], axis=0).astype(np.uint8)
+        for k in range(6)
+    ]
+    sharp = [other[:, 6 * k : 6 * k + WIDTH] for k in range(6)]
+    rest = [own[:, 6 * k : 6 * k + WIDTH] for k in range(19)]
+    assert found(tmp_path / "a", whip + rest) == ((1007,), [(1001, 1006)])
+    assert found(tmp_path / "b", sharp + rest) == ((1001, 1007), [])
+
+
+def test_a_step_over_dropped_frames_is_no_further_shot(shared_data):
+    """Of a wide arc 3 to 5 frames are missing four times."""
+    images = [frame.image for frame in read_frames(shared_data / "studiosim" / "d09_livingroom_wide" / "shot.mp4")]
+    dropped = {*range(10, 13), *range(25, 29), *range(40, 45), *range(60, 64)}
+    kept = [image for k, image in enumerate(images) if k not in dropped]
+    assert find_shots(kept) == [range(len(kept))]
 
 
 def test_frames_of_one_view_all_come():

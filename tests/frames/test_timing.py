@@ -87,3 +87,27 @@ def test_a_camera_that_stops_is_no_long_row_of_repeats():
     assert not any(found[:12])
     assert found[12:16] == [True, True, True, False]
     assert not any(found[15:])
+
+
+@pytest.mark.parametrize("light", [1.0, 0.2, 0.05])
+@pytest.mark.parametrize("noise", [0.0, 1.0])
+def test_the_light_of_a_shot_does_not_decide_what_repeats(light, noise):
+    """A dark image of low contrast changes by little; a step of a quarter of a pixel still makes it a new one."""
+    rng = np.random.default_rng(3)
+    images = [i[:, :, 0] * light + rng.normal(0, noise, i.shape[:2]) for i in moving_texture(24, 0.25)]
+    shown = [k for k in range(24) for _ in range(2 if k % 5 == 4 else 1)]
+    detector = RepeatDetector()
+    found = [detector.push(np.clip(images[k].round(), 0, 255).astype(np.uint8)) for k in shown]
+    assert found == [k > 0 and shown[k] == shown[k - 1] for k in range(len(shown))]
+
+
+@pytest.mark.parametrize("frames", [6, 30])
+def test_a_fade_hides_no_repeat_and_makes_none(frames):
+    """From full light to a twentieth and on in the dark, and the same backwards."""
+    images = grainy(moving_texture(60, 0.5))
+    light = np.interp(np.arange(60), [15, 15 + frames], [1.0, 0.05])
+    for ramp in (light, light[::-1]):
+        shown = [k for k in range(60) for _ in range(2 if k % 5 == 4 else 1)]
+        detector = RepeatDetector()
+        found = [detector.push(np.round(images[k] * ramp[k]).astype(np.uint8)) for k in shown]
+        assert found == [k > 0 and shown[k] == shown[k - 1] for k in range(len(shown))]
