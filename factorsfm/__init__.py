@@ -4,6 +4,8 @@
 import zlib  # noqa: F401  isort: skip
 import logging
 
+from factorsfm.alignment.align import Length, align
+from factorsfm.alignment.picks import Pick
 from factorsfm.api import reconstruct
 from factorsfm.camera.files import read_camera
 from factorsfm.camera.guess import guess_camera
@@ -28,6 +30,7 @@ from factorsfm.priors.depth import DepthFolder, DepthModel, DepthPrior
 from factorsfm.priors.depth_map import DepthKind, DepthMap
 from factorsfm.priors.masks import MaskFolder, MaskModel, MaskPrior
 from factorsfm.priors.object_masks import ObjectFolder, ObjectMasks
+from factorsfm.result.alignment import Alignment
 from factorsfm.result.moving import Moving, MovingStretch
 from factorsfm.result.reading import read_result
 from factorsfm.result.reconstruction import FrameResult, PriorFit, Reconstruction
@@ -43,6 +46,7 @@ logging.getLogger(__name__).addHandler(logging.NullHandler())
 
 __all__ = [
     "PRESETS",
+    "Alignment",
     "CameraObservability",
     "Control",
     "ControlFit",
@@ -67,6 +71,7 @@ __all__ = [
     "KnownDistance",
     "KnownHeight",
     "KnownPose",
+    "Length",
     "Live",
     "MapperOptions",
     "MarkedPoint",
@@ -81,6 +86,7 @@ __all__ = [
     "ObjectMasks",
     "ObjectResult",
     "Options",
+    "Pick",
     "PolishOptions",
     "PriorFit",
     "RawFormat",
@@ -94,6 +100,7 @@ __all__ = [
     "TrackerOptions",
     "UpAxis",
     "add_images",
+    "align",
     "condensed_factor",
     "factor_graph",
     "find_shots",
