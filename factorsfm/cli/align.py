@@ -9,6 +9,7 @@ from factorsfm.alignment.align import Length, align
 from factorsfm.cli.command import RESULT_FOLDER, Command, write_result
 from factorsfm.cli.progress_line import ProgressLine
 from factorsfm.report.result_folder import check_directory
+from factorsfm.report.thumbnails import retake
 from factorsfm.result.reading import read_result
 from factorsfm.support.errors import InputError
 
@@ -55,6 +56,7 @@ def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
         camera_height=arguments.camera_height,
         footage=arguments.footage,
     )
+    retake(aligned, arguments.footage)
     return write_result(aligned, output, progress)
 
 
