@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 import factorsfm
 from benchmarks.inputs import NETWORK_FILES
 from benchmarks.rows import Row, rows_table
+from factorsfm.alignment.picks import length_between, picked_point
 from factorsfm.camera.projection import PIXEL_CENTER
 from factorsfm.evaluation.readers import read_shot
 from factorsfm.evaluation.truth import Shot
@@ -149,16 +150,8 @@ def _scale(
         places.append(world.points(float(depth[row, column]) * ray[None])[0])
         picks.append(factorsfm.Pick(index, *(pixel - PIXEL_CENTER)))
     length = float(np.linalg.norm(places[1] - places[0]))
-    return scale_from_distance(result, factorsfm.Length(picks[0], picks[1], length))
-
-
-def scale_from_distance(result: factorsfm.Reconstruction, distance: factorsfm.Length) -> tuple[float, float]:
-    """New units in one of the result and its relative standard deviation, without a look at the footage."""
-    from factorsfm.alignment.picks import length_between, picked_point
-
-    ends = [picked_point(result, pick) for pick in (distance.a, distance.b) if isinstance(pick, factorsfm.Pick)]
-    length, std = length_between(*ends)
-    return distance.metres / length, std / length
+    found, std = length_between(*(picked_point(result, pick) for pick in picks))
+    return length / found, std / found
 
 
 def main() -> None:
@@ -178,7 +171,7 @@ def main() -> None:
                 continue
             shot = read_shot(folder)
             if not (work / folder.name).exists():
-                solved = factorsfm.reconstruct(shot.source, camera=shot.camera, depth=depth, masks=shot.masks)
+                solved = factorsfm.reconstruct(shot.source, camera=shot.camera, depth=depth)
                 solved.write(work / folder.name)
             rows[folder.name] = shot_row(shot, factorsfm.read_result(work / folder.name))
             print(folder.name, rows[folder.name], flush=True)
@@ -187,12 +180,17 @@ def main() -> None:
 
 def report(rows: dict[str, Row]) -> str:
     """The table with what it shows."""
-    return (
-        "# Alignment\n\n`python -m benchmarks.ground` makes this table: the default `align` of results with known lens, "
-        "beside the truth. Height is that of\nthe first camera above the ground, in true metres. Each distance is one "
-        "between two random pixels of a frame, edges of things and things\nthat move included; those that are refused "
-        "have too few tracks around a pixel.\n\n" + rows_table(rows) + "\n"
-    )
+    lines = [
+        "# Alignment",
+        "",
+        "`python -m benchmarks.ground` makes this table: the default `align` of results with known lens beside the",
+        "truth. Heights are those of the first camera above the ground, in true metres. A distance is one between two random",
+        "pixels of a frame, edges of things and things that move included; a pixel with too few tracks around it is",
+        "refused.",
+        "",
+        *rows_table("shot", rows),
+    ]
+    return "\n".join(lines)
 
 
 if __name__ == "__main__":
