@@ -184,9 +184,9 @@ def report(rows: dict[str, Row]) -> str:
         "# Alignment",
         "",
         "`python -m benchmarks.ground` makes this table: the default `align` of results with known lens beside the",
-        "truth. Heights are those of the first camera above the ground, in true metres. A distance is one between two random",
-        "pixels of a frame, edges of things and things that move included; a pixel with too few tracks around it is",
-        "refused.",
+        "truth. Heights are those of the first camera above the ground, in true metres. A distance is one between two",
+        "random pixels of a frame, edges of things and things that move included; pixels with too few tracks",
+        "around them are refused.",
         "",
         *rows_table("shot", rows),
     ]

@@ -94,7 +94,7 @@ def _check(
         raise InputError("a distance and the height of the camera are given; one of them sets the scale")
     if ("axis" in picks and "origin" not in picks) or ("plane" in picks and "axis" not in picks):
         raise InputError("an axis needs an origin, and a plane needs origin and axis; they are picked together")
-    lengths = {"distance": distance and distance.metres, "camera height": camera_height}
+    lengths = {"distance": None if distance is None else distance.metres, "camera height": camera_height}
     for name, length in lengths.items():
         if length is not None and not (np.isfinite(length) and length > 0):
             raise InputError(f"the {name} is {length:g}; a positive number of metres is expected")

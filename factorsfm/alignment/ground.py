@@ -66,13 +66,13 @@ def _levels(height: Array, tolerance: Array) -> Array:
     below = np.sort(height[height < 0])
     levels = below[:: max(1, len(below) // _LEVELS)]
     if not len(levels):
-        return levels
+        return np.asarray(levels)
     count = (np.abs(height[:, None] - levels) < tolerance[:, None]).sum(axis=0)
     enough = count >= max(_FEWEST, _LEAST_SHARE * len(height))
     # The best level within a tolerance of it: one at the rim of a crowd has part of its points only.
     reach = float(np.median(tolerance))
     best = np.array([count[k] == count[np.abs(levels - levels[k]) <= reach].max() for k in range(len(levels))])
-    return levels[enough & best]
+    return np.asarray(levels[enough & best])
 
 
 def _is_ground(points: Array, height: Array, tolerance: Array, up: Array, level: float, on: NDArray[np.int64]) -> bool:

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from factorsfm.export.footage import Sequence, background
 from factorsfm.export.shot import Shot
-from factorsfm.support.errors import InputError
 
 Array = NDArray[np.float64]
 
@@ -32,8 +31,8 @@ _PATTERN, _SEARCH = "-12 -12 12 12", "-24 -24 24 24"  # areas of a track around 
 _BLENDER = """
 import bpy
 
-clip = bpy.data.movieclips.load(DATA["footage"])
-clip.name = "factorsfm tracks"
+# Without footage the tracks are for the clip that is open.
+clip = bpy.data.movieclips.load(DATA["footage"]) if DATA["footage"] else bpy.data.movieclips[0]
 for name, frames, places in DATA["tracks"]:
     track = clip.tracking.tracks.new(name=name, frame=frames[0])
     for k, (frame, place) in enumerate(zip(frames, places)):
@@ -80,11 +79,7 @@ class Track:
 
 
 def tracks_of(shot: Shot) -> Iterator[Track]:
-    """The tracks of all points, in their order; where the lens has no inverse, a track has a gap.
-
-    Raises:
-        InputError: the result holds no tracks.
-    """
+    """The tracks of all points, in their order; where the lens has no inverse, a track has a gap."""
     result = shot.reconstruction
     number = np.array([shot.first_frame + frame.index for frame in result.frames])
     registered = np.array([frame.registered for frame in result.frames])
@@ -97,7 +92,7 @@ def tracks_of(shot: Shot) -> Iterator[Track]:
     rows = np.flatnonzero(registered[result.observation_frame] & np.isfinite(flat).all(axis=1))
     rows = rows[np.lexsort((result.observation_frame[rows], result.observation_point[rows]))]
     if not len(rows):
-        raise InputError("the result holds no tracks in frames with a pose")
+        return
     points, starts = np.unique(result.observation_point[rows], return_index=True)
     for point, mine in zip(points.tolist(), np.split(rows, starts[1:]), strict=True):
         numbers = number[result.observation_frame[mine]]
@@ -169,14 +164,13 @@ def _nuke_row(track: Track, height: int) -> str:
 def write_blender_tracks(shot: Shot, path: Path) -> None:
     """Write a script for Blender that loads the footage as a movie clip and gives it the tracks, as markers.
 
-    Markers lie on the footage, with its distortion, in frames of the clip, whose first one is 1.
+    Markers lie on the footage, with its distortion, in frames of the clip, whose first one is 1. Where there is no
+    footage, the tracks are for the clip that is open.
 
     Raises:
-        InputError: there is no footage.
+        InputError: the footage is a folder whose images are not a numbered sequence.
     """
     footage = background(shot)
-    if footage is None:
-        raise InputError("Blender's tracks belong to a movie clip; say where the footage is (footage)")
     file = footage.file(footage.first) if isinstance(footage, Sequence) else footage
     first, size = shot.footage_start - 1, np.array([shot.lens.width, shot.lens.height])
     tracks = []
@@ -184,7 +178,7 @@ def write_blender_tracks(shot: Shot, path: Path) -> None:
         places = track.xy / size
         places[:, 1] = 1.0 - places[:, 1]
         tracks.append((track.name, (track.numbers - first).tolist(), np.round(places, 9).tolist()))
-    text = json.dumps({"footage": file.as_posix(), "tracks": tracks}, allow_nan=False)
+    text = json.dumps({"footage": file and file.as_posix(), "tracks": tracks}, allow_nan=False)
     title = '"""Gives a movie clip in Blender the tracks of a factorsfm reconstruction."""'
     path.write_text(f"{title}\n\nimport json\n\nDATA = json.loads({text!r})\n{_BLENDER}", encoding="utf-8")
 

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from factorsfm.export import ExportOptions, export
-from factorsfm.support.errors import InputError
 from tests.exact_result import build
 from tests.export_problems import noise_images
 
@@ -121,5 +120,3 @@ def test_blender(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         if not marker.mute
     }
     compare(found, slice(2))
-    with pytest.raises(InputError, match="say where the footage is"):
-        written(tmp_path / "other", "tracks-blender")
