@@ -4,6 +4,8 @@
 import zlib  # noqa: F401  isort: skip
 import logging
 
+from factorsfm.alignment.align import Length, align
+from factorsfm.alignment.picks import Pick
 from factorsfm.api import reconstruct
 from factorsfm.camera.files import read_camera
 from factorsfm.camera.guess import guess_camera
@@ -29,6 +31,7 @@ from factorsfm.priors.depth import DepthFolder, DepthModel, DepthPrior
 from factorsfm.priors.depth_map import DepthKind, DepthMap
 from factorsfm.priors.masks import MaskFolder, MaskModel, MaskPrior
 from factorsfm.priors.object_masks import ObjectFolder, ObjectMasks
+from factorsfm.result.alignment import Alignment
 from factorsfm.result.moving import Moving, MovingStretch
 from factorsfm.result.reading import read_result
 from factorsfm.result.reconstruction import FrameResult, PriorFit, Reconstruction
@@ -44,6 +47,7 @@ logging.getLogger(__name__).addHandler(logging.NullHandler())
 
 __all__ = [
     "PRESETS",
+    "Alignment",
     "CameraObservability",
     "Control",
     "ControlFit",
@@ -68,6 +72,7 @@ __all__ = [
     "KnownDistance",
     "KnownHeight",
     "KnownPose",
+    "Length",
     "Live",
     "MapperOptions",
     "MarkedPoint",
@@ -82,6 +87,7 @@ __all__ = [
     "ObjectMasks",
     "ObjectResult",
     "Options",
+    "Pick",
     "PolishOptions",
     "PriorFit",
     "RawFormat",
@@ -95,6 +101,7 @@ __all__ = [
     "TrackerOptions",
     "UpAxis",
     "add_images",
+    "align",
     "condensed_factor",
     "factor_graph",
     "find_shots",

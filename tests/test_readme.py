@@ -34,6 +34,7 @@ DESCRIBED = {
     "stream": ["command-line.md", "streaming.md"],
     "batch": ["command-line.md", "films.md"],
     "extend": ["image-sets.md"],
+    "align": ["align.md"],
     "export": ["export.md"],
     "overlay": ["export.md"],
 }
@@ -250,7 +251,7 @@ def test_no_page_names_an_option_that_is_not_there(capsys: pytest.CaptureFixture
 def test_every_command_value_and_status_is_described() -> None:
     page = text_of(DOCS / "command-line.md")
     assert [row["command"].strip("`") for row in table(page, "command")] == [
-        "reconstruct", "stream", "batch", "extend", "export", "overlay", "demo",
+        "reconstruct", "stream", "batch", "extend", "align", "export", "overlay", "demo",
     ]  # fmt: skip
     assert set(DESCRIBED) == {row["command"].strip("`") for row in table(page, "command")}
     for column, values in (("kind", ShotKind), ("status", FrameStatus), ("preset", PRESETS)):

@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 
 from factorsfm import api
+from factorsfm.alignment.align import align
 from factorsfm.camera.files import open_camera
 from factorsfm.cli.command import (
     Command,
@@ -23,7 +24,7 @@ from factorsfm.cli.command import (
 )
 from factorsfm.cli.progress_line import ProgressLine
 from factorsfm.report.result_folder import check_directory, write_failure
-from factorsfm.support.errors import ReconstructionError
+from factorsfm.support.errors import InputError, ReconstructionError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -52,6 +53,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE.json",
         help="known poses, points, distances and heights: the result is in their world and unit",
     )
+    parser.add_argument(
+        "--align", action="store_true", help="the result stands on its ground, as factorsfm align makes it"
+    )
     add_imu(parser)
     parser.add_argument(
         "--work",
@@ -64,6 +68,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
     """Write the result, or the reason of the failure; see `Command.run`."""
     check_directory(arguments.output)
+    if arguments.align and arguments.control is not None:
+        raise InputError("--align and --control are given; a result in the world of its control is not aligned")
     camera, frames = open_camera(arguments.camera), range_of(arguments)
     begin = time.perf_counter()
     try:
@@ -91,6 +97,8 @@ def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
         seconds = {"total": time.perf_counter() - begin}
         write_failure(arguments.output, str(error), error.frames, as_given(arguments), seconds)
         raise
+    if arguments.align:
+        reconstruction = align(reconstruction)
     return write_result(reconstruction, arguments.output, progress)
 
 

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from factorsfm.export.shot import Shot
 from factorsfm.frames.folders import list_images
+from factorsfm.frames.frame import Frame
 from factorsfm.frames.numbering import missing_numbers
+from factorsfm.frames.reading import read_frames
 from factorsfm.frames.sequences import NUMBERED, sequence_numbers
+from factorsfm.result.reconstruction import FrameResult
 from factorsfm.support.errors import InputError
 
 logger = logging.getLogger(__name__)
@@ -81,3 +85,25 @@ def image_sequence(folder: Path) -> Sequence:
                 logger.warning("the images in %s have gaps: %s are missing", folder, missing)
             return Sequence(folder.absolute(), parts[0][1], digits, parts[0][3], numbers[0], numbers[-1], missing)
     raise InputError(f"the images in {folder} are not numbered alike, as film tools expect it of a sequence")
+
+
+def frames_of(shot: Shot, frames: Iterable[FrameResult]) -> Iterator[Frame]:
+    """The images of some frames of the result, in order, from its footage.
+
+    Raises:
+        InputError: while iterating, if the footage has no such frame, or another size.
+    """
+    assert shot.footage is not None
+    wanted = [(frame, frame.index + shot.numbering.shift) for frame in frames]
+    images = read_frames(shot.footage, slice(wanted[0][1], wanted[-1][1] + 1), fields=shot.fields)
+    for frame, index in wanted:
+        found = next((image for image in images if image.index == index), None)
+        if found is None:
+            raise InputError(f"{shot.footage} has no frame {index}; it is not the shot of this result")
+        camera, (height, width) = shot.reconstruction.camera_of(frame), found.image.shape[:2]
+        if (width, height) != (camera.width, camera.height):
+            raise InputError(
+                f"frame {index} of {shot.footage} has {width}x{height} pixels, "
+                f"the result {camera.width}x{camera.height}"
+            )
+        yield found

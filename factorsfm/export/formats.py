@@ -16,6 +16,13 @@ from factorsfm.export.options import ExportOptions, UpAxis
 from factorsfm.export.ply import write_ply
 from factorsfm.export.shot import Defaults, Shot, make_shot
 from factorsfm.export.stmap import write_stmaps, write_undistorted
+from factorsfm.export.tracks import (
+    write_3de_tracks,
+    write_after_effects_tracks,
+    write_blender_tracks,
+    write_csv_tracks,
+    write_nuke_tracks,
+)
 from factorsfm.export.trajectory import write_kitti, write_tum
 from factorsfm.export.usd import write_usd
 from factorsfm.export.writing import complete_file, complete_folder
@@ -77,6 +84,17 @@ FORMATS = {
     "stmap": Format("maps that undistort and distort, 32-bit EXR", write_stmaps, is_folder=True),
     "undistorted": Format(
         "the footage without distortion", write_undistorted, is_folder=True, defaults=Defaults(first_frame=1001)
+    ),
+    "tracks-csv": Format("2-D tracks as a table", write_csv_tracks),
+    "tracks-nuke": Format("2-D tracks as a Nuke Tracker", write_nuke_tracks, defaults=Defaults(first_frame=1001)),
+    "tracks-3de": Format(
+        "2-D tracks as text for 3DEqualizer", write_3de_tracks, defaults=Defaults(first_frame=1, numbered=False)
+    ),
+    "tracks-blender": Format(
+        "script that gives a movie clip the 2-D tracks", write_blender_tracks, defaults=Defaults(first_frame=1)
+    ),
+    "tracks-after-effects": Format(
+        "script that makes nulls of the 2-D tracks", write_after_effects_tracks, defaults=Defaults(numbered=False)
     ),
 }
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.objects.object_result import ObjectFrame, ObjectResult
+from factorsfm.objects.object_result import ObjectResult
 
 Array = NDArray[np.float64]
 
@@ -46,18 +45,3 @@ def moving_nulls(objects: tuple[ObjectResult, ...], first_frame: int) -> list[Mo
         numbers = [first_frame + frame.index for frame in thing.frames]
         found.append(MovingNull(name, numbers, matrices, thing.points, thing.colors))
     return found
-
-
-def object_in_world(thing: ObjectResult, world: Array, scale: float) -> ObjectResult:
-    """An object in another world: its own axes are turned, too, so that they are those of the world at first.
-
-    Args:
-        world: (3, 3) rotation from the world to the other one; scale: length there of one unit here.
-    """
-    turn = pycolmap.Rotation3d(world)
-    frames = []
-    for frame in thing.frames:
-        pose = frame.world_from_object
-        turned = pycolmap.Rigid3d(turn * pose.rotation * turn.inverse(), scale * world @ pose.translation)
-        frames.append(ObjectFrame(frame.index, turned, frame.covariance))
-    return replace(thing, frames=tuple(frames), points=scale * thing.points @ world.T)

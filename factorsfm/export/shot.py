@@ -8,7 +8,7 @@ the chosen axis points up in the first frame, and scales it. It does not level t
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
@@ -16,13 +16,14 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.export.moving import MovingNull, moving_nulls, object_in_world
+from factorsfm.export.moving import MovingNull, moving_nulls
 from factorsfm.export.options import ExportOptions, UpAxis
 from factorsfm.export.other_footage import Numbering, at_size_of, match_numbers
 from factorsfm.frames.fields import Fields
 from factorsfm.result.image_sources import fields_of
+from factorsfm.result.other_world import in_other_world
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
-from factorsfm.support.errors import InputError
+from factorsfm.support.similarity import Similarity
 
 _TURNED_WORLD = {  # exported world from the reconstruction's
     UpAxis.MINUS_Y: np.eye(3),
@@ -111,7 +112,7 @@ class Shot:
     """The input of the writer of a format.
 
     Attributes:
-        reconstruction: rotated and scaled to the exported world, without covariances and prior fits.
+        reconstruction: rotated and scaled to the exported world.
         fps: frames per second.
         first_frame: number of frame 0 of the source, be there one or not: what is added to the index of a frame.
         numbering: which frame of the footage is which.
@@ -250,7 +251,7 @@ def make_shot(reconstruction: Reconstruction, options: ExportOptions, defaults: 
         reconstruction = at_size_of(reconstruction, Path(options.footage))
     numbering = match_numbers(reconstruction, footage)
     return Shot(
-        reconstruction=_in_world(reconstruction, world, scale),
+        reconstruction=in_other_world(reconstruction, Similarity(scale, world, np.zeros(3))),
         fps=options.fps or _source_fps(reconstruction.frames) or _DEFAULT_FPS,
         first_frame=_first_frame(options, defaults, numbering),
         numbering=numbering,
@@ -270,21 +271,6 @@ def _first_frame(options: ExportOptions, defaults: Defaults, numbering: Numberin
     if defaults.numbered and numbering.timeline is not None:
         return numbering.timeline
     return defaults.first_frame + numbering.shift - numbering.footage_first
-
-
-def _in_world(reconstruction: Reconstruction, world: NDArray[np.float64], scale: float) -> Reconstruction:
-    old_from_new = pycolmap.Rotation3d(world.T)
-    frames = [replace(frame, covariance=None, relative_covariance=None, prior=None) for frame in reconstruction.frames]
-    for frame in frames:
-        pose = frame.cam_from_world
-        if pose is not None:
-            frame.cam_from_world = pycolmap.Rigid3d(pose.rotation * old_from_new, scale * pose.translation)
-    points = scale * reconstruction.points.reshape(-1, 3) @ world.T
-    translations = [frame.cam_from_world.translation for frame in frames if frame.cam_from_world is not None]
-    if not (np.isfinite(points).all() and np.isfinite(translations).all()):
-        raise InputError(f"the scene is not finite at scale {scale:g}")
-    objects = tuple(object_in_world(thing, world, scale) for thing in reconstruction.objects)
-    return replace(reconstruction, frames=frames, points=points, objects=objects)
 
 
 def _source_fps(frames: list[FrameResult]) -> float | None:

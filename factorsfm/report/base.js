@@ -44,6 +44,7 @@ function coalesced(draw) {
 // ---- points, cameras and tracks -------------------------------------------------------------------------
 
 const points = typed(data.points, Float32Array), colors = typed(data.colors, Uint8Array);
+const ground = data.ground ? typed(data.ground, Float32Array) : new Float32Array(); // ends of lines
 const centers = typed(data.centers, Float32Array), rotations = typed(data.rotations, Float32Array);
 const pointCount = points.length / 3, cameraCount = centers.length / 3;
 const cameraOf = new Map((data.positions || []).map((position, row) => [position, row]));

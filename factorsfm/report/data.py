@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from factorsfm.report.charts import charts
 from factorsfm.report.geometry import Tracks, median_prior_residuals, scene, tracks
+from factorsfm.report.props import place_props
 from factorsfm.report.wording import status_words
 from factorsfm.result.moving import Moving
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
@@ -44,8 +45,19 @@ def reconstruction_data(reconstruction: Reconstruction) -> dict[str, Any]:
             tracks(reconstruction, view, _MAX_OBSERVATIONS),
             [reconstruction.camera_of(f) for f in reconstruction.frames],
         ),
+        "ground": _ground(reconstruction),
         "moving": None if reconstruction.moving is None else _moving_data(reconstruction.moving, reconstruction),
     }
+
+
+def _ground(reconstruction: Reconstruction) -> str | None:
+    """The lines (n, 2, 3) of a grid on the ground of an aligned result, in the axes of the first camera."""
+    alignment, first = reconstruction.alignment, next(iter(reconstruction.registered), None)
+    if alignment is None or alignment.ground_height is None or first is None or not len(reconstruction.points):
+        return None
+    assert first.cam_from_world is not None
+    ends = place_props(reconstruction).grid[:, [0, -1]]
+    return _base64(np.asarray(first.cam_from_world * ends.reshape(-1, 3)), "<f4")
 
 
 def frames_data(

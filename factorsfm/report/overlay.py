@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,11 +12,10 @@ import pycolmap
 from numpy.typing import NDArray
 
 from factorsfm.camera.projection import PIXEL_CENTER
+from factorsfm.export.footage import frames_of
 from factorsfm.export.options import ExportOptions
-from factorsfm.export.shot import Defaults, Lens, Shot, make_shot
+from factorsfm.export.shot import Defaults, Lens, make_shot
 from factorsfm.export.writing import complete_file
-from factorsfm.frames.frame import Frame
-from factorsfm.frames.reading import read_frames
 from factorsfm.frames.video import count_frames
 from factorsfm.report.props import Props, place_props
 from factorsfm.report.wording import status_words
@@ -129,7 +128,7 @@ def write_overlay(
         if not video.isOpened():
             raise InputError(f"OpenCV cannot write the video {path}")
         try:
-            for position, frame in enumerate(_footage(shot.footage, shot)):
+            for position, frame in enumerate(frames_of(shot, frames)):
                 if progress is not None:
                     progress("overlay", position, len(frames))
                 image = draw_overlay(reconstruction, position, frame.image, props, projector, layers)
@@ -181,23 +180,6 @@ def draw_overlay(
         _draw_legend(canvas)
     _label(canvas, frame)
     return canvas
-
-
-def _footage(source: Path, shot: Shot) -> Iterator[Frame]:
-    """The frames of the reconstruction, in order."""
-    camera = shot.reconstruction.camera
-    wanted = [frame.index + shot.numbering.shift for frame in shot.reconstruction.frames]
-    images = read_frames(source, slice(wanted[0], wanted[-1] + 1), fields=shot.fields)
-    for index in wanted:
-        found = next((image for image in images if image.index == index), None)
-        if found is None:
-            raise InputError(f"{source} has no frame {index}; it is not the shot of this result")
-        height, width = found.image.shape[:2]
-        if (width, height) != (camera.width, camera.height):
-            raise InputError(
-                f"frame {index} of {source} has {width}x{height} pixels, the result {camera.width}x{camera.height}"
-            )
-        yield found
 
 
 def _draw_grid(canvas: Image, lines: Array) -> None:

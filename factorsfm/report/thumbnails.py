@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.result.reconstruction import FrameResult
+from factorsfm.export.footage import frames_of
+from factorsfm.export.options import ExportOptions
+from factorsfm.export.shot import Defaults, make_shot
+from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.support.context import Closing
+from factorsfm.support.errors import InputError
+
+logger = logging.getLogger(__name__)
 
 _WIDTH = 384
 _QUALITY = 60  # of JPEG
@@ -97,3 +105,19 @@ def _done(jpeg: bytes) -> Future[bytes]:
     done: Future[bytes] = Future()
     done.set_result(jpeg)
     return done
+
+
+def retake(result: Reconstruction, footage: Path | None = None) -> None:
+    """Give a result that was read back its thumbnails, if its footage is at hand; see `ExportOptions.footage`."""
+    try:
+        shot = make_shot(result, ExportOptions(footage=footage), Defaults())
+        if shot.footage is None:
+            return
+        with Thumbnails() as thumbnails:
+            for image in frames_of(shot, result.frames):
+                thumbnails.add(image.image)
+    except InputError as error:  # a report without pictures is one, too
+        logger.info("no thumbnails: %s", error)
+        return
+    for frame, jpeg in zip(result.frames, thumbnails.by_frame(), strict=True):
+        frame.thumbnail = jpeg

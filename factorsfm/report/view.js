@@ -118,6 +118,12 @@ function drawScene() {
   };
   const line = (a, b) => { if (a && b) { context.moveTo(...a); context.lineTo(...b); } };
 
+  context.strokeStyle = css("--quiet");
+  context.lineWidth = 0.5 * ratio;
+  context.beginPath();
+  for (let i = 0; i < ground.length; i += 6) line(project(ground.subarray(i, i + 3)), project(ground.subarray(i + 3, i + 6)));
+  context.stroke();
+
   context.strokeStyle = css("--path");
   context.lineWidth = 1.8 * ratio;
   context.lineCap = "round";

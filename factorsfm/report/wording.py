@@ -57,7 +57,10 @@ def explanation(reconstruction: Reconstruction) -> list[str]:
                 f"Up to {100 * share:.0f} % of what is known of the camera's position comes from the depth prior, "
                 "the rest from parallax."
             )
-    if reconstruction.metric:
+    alignment = reconstruction.alignment
+    if alignment is not None:
+        sentences += alignment.sentences("m" if reconstruction.metric else "units")
+    elif reconstruction.metric:
         sentences.append("Lengths are in metres, as far as the depth prior is right.")
     else:
         sentences.append("The size of the scene is free: scale it by a length that you know.")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -22,10 +22,10 @@ from factorsfm.priors.depth_map import DepthKind
 from factorsfm.result.frame_results import SourceFrame, frame_results
 from factorsfm.result.moving import Moving, moving_in
 from factorsfm.result.notes import result_doubts, result_notes
+from factorsfm.result.other_world import in_other_world
 from factorsfm.result.reconstruction import LensFit, ObservationNoise, Reconstruction, RollingShutter
 from factorsfm.support.parallax import parallax
 from factorsfm.support.rotations import camera_centers
-from factorsfm.support.similarity import Similarity
 from factorsfm.support.status import ShotKind
 
 Array = NDArray[np.float64]
@@ -96,8 +96,8 @@ def assemble(
     result.notes += result_notes(
         polished, result, guessed, depth_given=depth_kind is not None, has_depth=has_depth, interval=interval
     )
-    if polished.world_alignment is not None:
-        _place(result, polished.world_alignment)
+    if polished.world_alignment is not None:  # the result has its size already
+        result = in_other_world(result, replace(polished.world_alignment, scale=1.0))
     return result
 
 
@@ -126,14 +126,6 @@ def _scale(polished: Polished, images: Sequence[MappedImage], depth_kind: DepthK
     depths = [images[polished.frames[row]].tracks.depth for row in polished.prior.images]
     units = np.array([depth.unit for depth in depths if depth is not None])
     return 1.0 / float(np.median(polished.state.scale * units))
-
-
-def _place(result: Reconstruction, alignment: Similarity) -> None:
-    """Turn and move a result, which has its size, into the world of its control."""
-    world_from_first = pycolmap.Rigid3d(pycolmap.Rotation3d(alignment.rotation), alignment.translation)
-    for frame in result.registered:
-        frame.cam_from_world = frame.cam_from_world * world_from_first.inverse()
-    result.points = result.points @ alignment.rotation.T + alignment.translation
 
 
 # --- points and observations --------------------------------------------------------------------------------------

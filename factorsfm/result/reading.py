@@ -17,6 +17,7 @@ from factorsfm.control.fit import ControlFit
 from factorsfm.inertial.fit import ImuFit
 from factorsfm.motion.stretches import Stretch
 from factorsfm.polish.observability import CameraObservability
+from factorsfm.result.alignment import Alignment
 from factorsfm.result.moving import read_moving
 from factorsfm.result.objects import read_objects
 from factorsfm.result.reconstruction import FrameResult, LensFit, PriorFit, Reconstruction, RollingShutter
@@ -81,6 +82,7 @@ class _Summary:
     statuses: list[_Status]
     doubts: list[str] = field(default_factory=list)
     stretches: list[_Stretch] = field(default_factory=list)
+    alignment: Alignment | None = None
 
 
 def read_result(directory: str | Path) -> Reconstruction:
@@ -160,6 +162,7 @@ def _reconstruction(summary: _Summary, model: pycolmap.Reconstruction) -> Recons
         metric=summary.metric,
         control=summary.control,
         imu=summary.imu,
+        alignment=summary.alignment,
         doubts=summary.doubts,
         notes=summary.notes,
         seconds=summary.seconds,

@@ -17,6 +17,7 @@ from factorsfm.inertial.fit import ImuFit
 from factorsfm.motion.stretches import Stretch
 from factorsfm.objects.object_result import ObjectResult
 from factorsfm.polish.observability import CameraObservability
+from factorsfm.result.alignment import Alignment
 from factorsfm.result.moving import Moving
 from factorsfm.support.status import FrameStatus, ShotKind
 
@@ -187,6 +188,7 @@ class Reconstruction:
             None if the poses are not fitted to recorded images (`RollingShutter.recorded`), or if unknown.
         metric: whether the world unit is the metre (from a metric prior, or from control).
         control: how well the control is met, or factors that were added; None without either.
+        alignment: where up, ground, origin and unit of the world come from, if it was aligned (`align`).
         imu: what an IMU has given, None without one that took part.
         moving: what moves by itself, left out of all else; None where nothing was found. What a mask covers was never
             looked at.
@@ -218,6 +220,7 @@ class Reconstruction:
     metric: bool = False
     control: ControlFit | None = None
     imu: ImuFit | None = None
+    alignment: Alignment | None = None
     moving: Moving | None = None
     doubts: list[str] = field(default_factory=list)
     objects: tuple[ObjectResult, ...] = ()

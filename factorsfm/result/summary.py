@@ -40,6 +40,7 @@ def summary(reconstruction: Reconstruction) -> dict[str, Any]:
         "metric": reconstruction.metric,
         "control": reconstruction.control and asdict(reconstruction.control),
         "imu": reconstruction.imu and asdict(reconstruction.imu),
+        "alignment": reconstruction.alignment and asdict(reconstruction.alignment),
         "moving": [asdict(stretch) for stretch in reconstruction.moving.stretches] if reconstruction.moving else [],
         "objects": [_object_json(found) for found in reconstruction.objects],
         "reprojection_error": median_reprojection_error(reconstruction),
@@ -116,6 +117,8 @@ def conclusion(reconstruction: Reconstruction, output: Path) -> str:
     judged = verdict_of(reconstruction)
     doubts = [f"{Grade.DOUBTFUL}: {doubt}" for doubt in judged.doubts]
     notes = [f"Note: {note}" for note in reconstruction.notes]
+    if reconstruction.alignment is not None:
+        notes += reconstruction.alignment.sentences("m" if reconstruction.metric else "units")
     parts = [f"{part_name(n)}: {verdict(other)}." for n, other in enumerate(reconstruction.others, 2)]
     last = f"{judged.grade}. Result in {output}; open {output / 'report.html'}"
     return "\n".join([f"{verdict(reconstruction)}.", *doubts, *notes, *parts, last])

@@ -8,10 +8,11 @@ import numpy as np
 import pycolmap
 import pytest
 
+from factorsfm.alignment.planes import find_plane
 from factorsfm.cli.main import main
 from factorsfm.frames.reading import read_frames
 from factorsfm.report.overlay import Projector, draw_overlay, write_overlay
-from factorsfm.report.props import find_plane, place_props
+from factorsfm.report.props import place_props
 from factorsfm.report.result_folder import write_folder
 from factorsfm.result.moving import Moving, MovingStretch
 from factorsfm.result.reconstruction import FrameResult, Reconstruction

@@ -1,0 +1,122 @@
+"""2-D tracks read back frame by frame, in the conventions of each program."""
+
+import csv
+import json
+import re
+import types
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from factorsfm.export import ExportOptions, export
+from tests.exact_result import build
+from tests.export_problems import noise_images
+
+FIRST = 1001
+HEIGHT, WIDTH = 480, 640
+
+
+def expected() -> dict[tuple[str, int], np.ndarray]:
+    """Pixels from the top left corner by track and number of the frame: raw x, y and x, y of the pinhole."""
+    result = build()
+    found = {}
+    for position, point, xy in zip(
+        result.observation_frame.tolist(), result.observation_point.tolist(), result.observation_xy, strict=True
+    ):
+        frame = result.frames[position]
+        if frame.cam_from_world is not None:
+            x, y, z = frame.cam_from_world * result.points[point]
+            flat = [500 * x / z + 321, 510 * y / z + 239]
+            found[f"track_{point + 1:05d}", FIRST + frame.index] = np.array([*(xy + 0.5), *flat])
+    return found
+
+
+def compare(found: dict[tuple[str, int], Any], part: slice, tolerance: float = 2e-6) -> None:
+    truth = expected()
+    assert found.keys() == truth.keys()
+    for key, place in found.items():
+        np.testing.assert_allclose(place, truth[key][part], atol=tolerance)
+
+
+def written(folder: Path, format: str, **options: Any) -> str:
+    export(build(), folder / "out", format=format, options=ExportOptions(first_frame=FIRST, **options))
+    return (folder / "out").read_text()
+
+
+def test_csv(tmp_path: Path) -> None:
+    rows = list(csv.DictReader(written(tmp_path, "tracks-csv").splitlines()))
+    columns = ("x", "y", "x_undistorted", "y_undistorted")
+    compare({(r["track"], int(r["frame"])): [float(r[c]) for c in columns] for r in rows}, slice(4), 1e-5)
+
+
+def test_3de(tmp_path: Path) -> None:
+    lines = iter(written(tmp_path, "tracks-3de").splitlines())
+    found = {}
+    for _ in range(int(next(lines))):
+        name, color, count = next(lines), next(lines), int(next(lines))
+        assert color == "0"
+        for _ in range(count):
+            number, x, y = next(lines).split()
+            found[name, int(number)] = [float(x), HEIGHT - float(y)]
+    assert next(lines, None) is None
+    compare(found, slice(2))
+
+
+def test_nuke_tracks_lie_on_the_undistorted_plate(tmp_path: Path) -> None:
+    text = written(tmp_path, "tracks-nuke")
+    assert text.count("{") == text.count("}")
+    columns, tracks = re.findall(r"tracks \{ \{ 1 (\d+) (\d+) \}", text)[0]
+    assert (columns, tracks) == ("31", "40")
+    assert (
+        len(re.findall(r"^\{?\s*\{ \d 1? ?\d+ \w+ \w+ 1 \}|^\{ \{? ?\d \d \d+ \w+ \w+ 1 \}", text, re.MULTILINE)) == 31
+    )
+    found = {}
+    for name, x, y in re.findall(r'\} "(\w+)" \{curve ([^}]*)\} \{curve ([^}]*)\}', text):
+        for (number, value), (same, other) in zip(
+            re.findall(r"x(\d+) (\S+)", x), re.findall(r"x(\d+) (\S+)", y), strict=True
+        ):
+            assert number == same
+            found[name, int(number)] = [float(value), HEIGHT - float(other)]
+    compare(found, slice(2, 4), 1e-5)
+
+
+def test_after_effects(tmp_path: Path) -> None:
+    text = written(tmp_path, "tracks-after-effects", fps=25)
+    data = json.loads(re.findall(r"var DATA = (.*);\n", text)[0])
+    found = {}
+    for track in data["tracks"]:
+        for time, (x, y) in zip(track["times"], track["places"], strict=True):
+            # As its footage is placed: the optical axis in the middle, pixels square.
+            place = [x - WIDTH / 2 + 321, (y - HEIGHT / 2) * 510 / 500 + 239]
+            found[track["name"], FIRST + round(25 * time)] = place
+    compare(found, slice(2))
+
+
+def test_blender(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The script with a stand-in for Blender that keeps its markers."""
+    footage = noise_images(tmp_path / "shot", 21)
+    script = written(tmp_path, "tracks-blender", footage=footage)
+    markers: dict[str, dict[int, Any]] = {}
+
+    def new(name: str, frame: int) -> Any:
+        mine = markers.setdefault(name, {})
+
+        def insert(at: int, co: Any) -> Any:
+            mine[at] = types.SimpleNamespace(co=co, mute=False)
+            return mine[at]
+
+        return types.SimpleNamespace(markers=types.SimpleNamespace(insert_frame=insert))
+
+    clip = types.SimpleNamespace(tracking=types.SimpleNamespace(tracks=types.SimpleNamespace(new=new)))
+    data = types.SimpleNamespace(movieclips=types.SimpleNamespace(load=lambda path: clip))
+    monkeypatch.setitem(__import__("sys").modules, "bpy", types.SimpleNamespace(data=data))
+    exec(compile(script, "tracks.py", "exec"), {})
+    found = {
+        (name, FIRST - 1 + number): [marker.co[0] * WIDTH, (1 - marker.co[1]) * HEIGHT]
+        for name, mine in markers.items()
+        for number, marker in mine.items()
+        if not marker.mute
+    }
+    compare(found, slice(2))
