@@ -15,6 +15,7 @@ from factorsfm.adjustment.some_frames import some_frames
 from factorsfm.adjustment.state import LENS_SIZE, State
 from factorsfm.lens.certainty import lens_covariances
 from factorsfm.lens.solver import LensSolver, NotInvertibleError
+from factorsfm.motion.readings import Reading, cost, solution_from
 from factorsfm.motion.shot_kind import LEAST_GAIN, translation_gain
 from factorsfm.support.options import PolishOptions
 from factorsfm.support.semidefinite import squared_deviations
@@ -36,6 +37,8 @@ _COMPONENTS = 4  # slow cosines in which a zoom must be significant
 _LEAST_EVIDENCE = 16.0  # squared standard deviations
 # Of the cost with one focal length: below, there is no doubt of a zoom, or a reason to try one.
 _CERTAIN, _SUSPECTED = 0.5, 0.8
+_MOST = 0.9  # of the tracks: a solution with fewer of them is no better than one with a zoom that has all
+_FLAT = 0.1  # of log depth, between a tenth of the points at either end: a room seen head-on has 0.3
 _LEAST_ZOOM = 0.02  # of log focal length: moving things and focus pulls change it by less
 
 
@@ -87,30 +90,45 @@ def find_zoom(known: BundleAdjustment, times: Array, options: PolishOptions) -> 
 
 
 def unannounced_zoom(
-    known: BundleAdjustment, fixed: BundleAdjustment, times: Array, options: PolishOptions, *, doubtful: bool
+    guess: State, few: Observations, fixed: Reading, times: Array, options: PolishOptions, *, doubtful: bool
 ) -> Zoom | None:
     """A zoom that nobody has asked for, None where one focal length explains the tracks as well.
 
     Args:
-        known: as in `find_zoom`; fixed: the best solution with one focal length.
-        doubtful: whether that does not fit. One that does is none where the camera of it moves, and one that turns and
-            zooms does as well: a zoom looks like a way towards a wall, and is the simpler reading.
+        guess: cameras and points through the first guess of the focal length; few: the tracks of all these points.
+        fixed: the best solution with one focal length. Where there is a zoom, what it moves may seem to move by itself
+            and be left out of that, and the focal length may be anything: so the zoom starts from the guess.
+        times: (k,) of the frames, in frames.
+        doubtful: whether the solution does not fit. One that does is none where its scene is flat, and a camera that
+            turns and zooms does as well: a zoom looks like a way towards a wall, and is the simpler reading.
     """
-    if len(times) < _SHORTEST or not (doubtful or _turns_and_zooms(fixed, times, options)):
+    if len(times) < _SHORTEST:
         return None
-    zoom = find_zoom(known, times, options)
+    doubtful |= len(fixed.kept) < _MOST * len(guess.bearing)
+    simpler = not doubtful and _is_flat(fixed.adjustment.state) and _turns_and_zooms(fixed.adjustment, times, options)
+    if not (doubtful or simpler):
+        return None
+    zoom = find_zoom(solution_from(guess, few, options), times, options)
     if zoom is None or not zoom.found:
         return None
-    share = _share_of_cost(zoom, fixed)
+    share = _share_of_cost(zoom, fixed, few)
     logger.info("a zoom of %.2f that nobody announced costs %.2f of what one focal length does", zoom.ratio, share)
-    simpler = zoom.turns and not doubtful
+    simpler &= zoom.turns
     return replace(zoom, certain=simpler or share < _CERTAIN) if simpler or share < _SUSPECTED else None
 
 
-def _share_of_cost(zoom: Zoom, fixed: BundleAdjustment) -> float:
-    """Cost of the tracks with a zoom over that with one focal length, judged with the same noise."""
-    with_one, with_zoom = (float(p.observation_costs().sum()) for p in _at_one_scale(fixed, zoom.adjustment))
-    return with_zoom / max(with_one, 1e-300)
+def _share_of_cost(zoom: Zoom, fixed: Reading, few: Observations) -> float:
+    """Cost of all tracks with a zoom over that with one focal length, judged with the same noise."""
+    whole = Reading(np.arange(len(zoom.adjustment.state.bearing)), zoom.adjustment)
+    sigma = min(zoom.adjustment.sigma, fixed.adjustment.sigma)
+    return cost(whole, few, sigma) / max(cost(fixed, few, sigma), 1e-300)
+
+
+def _is_flat(state: State) -> bool:
+    """Whether the scene is a wall across the view of the world's camera."""
+    depth = state.bearing[:, 2] / np.maximum(state.inverse_distance, 1e-9)
+    near, far = np.quantile(np.maximum(depth, 1e-9), [0.1, 0.9])
+    return bool(np.log(far / near) < _FLAT)
 
 
 def _turns_and_zooms(fixed: BundleAdjustment, times: Array, options: PolishOptions) -> bool:

@@ -21,7 +21,7 @@ from factorsfm.lens.zoom import Zoom, find_zoom, unannounced_zoom
 from factorsfm.mapping.all_points import triangulated, with_all_points
 from factorsfm.motion.at_rest import Rest
 from factorsfm.motion.moving import center_and_spread, log_errors, moving_together
-from factorsfm.motion.readings import solution_from
+from factorsfm.motion.readings import Reading, solution_from
 from factorsfm.motion.shot_kind import Motion, classify_motion
 from factorsfm.motion.suspects import agreeing
 from factorsfm.polish.camera_starts import best_solution, core_tracks, is_doubtful, on_what_fits
@@ -114,14 +114,20 @@ def _solved_core(shot: Shot, frames: list[int], observations: Observations, trac
     o = options.polish
     trusted = shot.trusted(tracks)
     core = trusted[core_tracks(observations.of(trusted), len(frames))]
-    few = observations.of(core)
-    guess = _first_guess(shot, frames, few, tracks[core], _world(observations))
-    found, search = turning_reading(guess, few, options), None
+    whole = observations.of(core)
+    first = guess = _first_guess(shot, frames, whole, tracks[core], _world(observations))
+    found, search = turning_reading(guess, whole, options), None
     if found is None:
         if options.refine_focal_length and options.lens != "zoom":
-            search = _searched(guess, few, options)
+            search = _searched(guess, whole, options)
             guess = through(guess, search.straight.focal) if search.better else guess
-        found = unless_at_rest(best_solution(guess, few, options), guess, few, options)
+        found = unless_at_rest(best_solution(guess, whole, options), guess, whole, options)
+
+    def zoom_beside(fixed: BundleAdjustment) -> Zoom | None:
+        """A zoom that nobody announced, beside a solution with one focal length."""
+        reading, doubtful = Reading(found.kept, fixed), is_doubtful(fixed, options)
+        return unannounced_zoom(first, whole, reading, shot.times(frames), o, doubtful=doubtful)
+
     adjustment, few = found.adjustment, found.adjustment.observations
     motion, lens, shutter, zoom = None, None, None, None
     if few.sweep is not None:
@@ -130,16 +136,19 @@ def _solved_core(shot: Shot, frames: list[int], observations: Observations, trac
     if shutter is not None:
         adjustment = solution_from(replace(adjustment.state, lens=shutter.lens.shape), few, options.polish)
     if options.estimates_lens:
-        adjustment, lens, zoom = _estimate_lens(adjustment, shot, frames, options, search, moves=not found.turns)
+        adjustment, lens, zoom = _estimate_lens(
+            adjustment, shot, frames, options, search, zoom_beside, moves=not found.turns
+        )  # fmt: skip
         shutter = shutter and shutter.known_with(lens)
     elif shot.in_time and is_doubtful(adjustment, options):
-        zoom = unannounced_zoom(adjustment, adjustment, shot.times(frames), options.polish, doubtful=True)
+        zoom = zoom_beside(adjustment)
     if motion is None or lens is not None or shutter is not None:
         motion = _motion(adjustment, found.rest, o)
-    kept, left_out = core[found.kept], np.delete(core, found.kept)
-    suspected = 0.0 if zoom is None else zoom.ratio
+    # A zoom that nobody announced is solved on all tracks: some of them may have seemed to move by themselves.
+    kept = found.kept if lens is None or lens.announced else np.arange(len(core))
     return Core(
-        kept, left_out, adjustment, motion, lens, shutter, found.turns, found.rest, found.rival, suspected
+        core[kept], np.delete(core, kept), adjustment, motion, lens, shutter, found.turns, found.rest, found.rival,
+        0.0 if zoom is None else zoom.ratio,
     )  # fmt: skip
 
 
@@ -194,20 +203,20 @@ def _estimate_lens(
     frames: list[int],
     options: Options,
     search: FoundLens | None,
+    zoom_beside: Callable[[BundleAdjustment], Zoom | None],
     *,
     moves: bool,
 ) -> tuple[BundleAdjustment, LensEstimate, Zoom | None]:
     """As `estimate_lens`, with a focal length for every frame where there is a zoom; and one that is only suspected."""
-    zoom, suspected, times = None, None, shot.times(frames)
+    zoom, suspected = None, None
     if options.lens == "zoom" and len(adjustment.state.log_focal) == 1:
-        zoom = find_zoom(adjustment, times, options.polish)
+        zoom = find_zoom(adjustment, shot.times(frames), options.polish)
     if zoom is None or not zoom.found:
         first = shot.first_focal or (shot.guess.focal, 0.0)
         fixed, lens = estimate_lens(adjustment, options, first_focal=first, search=search, moves=moves)
-        if options.lens == "distortion" and shot.in_time and len(adjustment.state.log_focal) == 1:
-            doubtful = is_doubtful(fixed, options)
-            if moves or doubtful:
-                suspected = unannounced_zoom(adjustment, fixed, times, options.polish, doubtful=doubtful)
+        alone = options.lens == "distortion" and shot.in_time and len(adjustment.state.log_focal) == 1
+        if alone and (moves or is_doubtful(fixed, options)):
+            suspected = zoom_beside(fixed)
         if suspected is None or not suspected.certain:
             return fixed, replace(lens, zoom_std=zoom.std if zoom else None), suspected
         zoom = suspected
