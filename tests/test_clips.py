@@ -13,6 +13,7 @@ from factorsfm import PRESETS, DepthModel, ShotKind
 from factorsfm.evaluation.metrics import TrajectoryErrors, trajectory_errors
 from factorsfm.evaluation.readers import Shot, read_shot
 from factorsfm.export.formats import export
+from factorsfm.result.summary import focal_range
 from factorsfm.support.similarity import pose_arrays
 from tests.rendered import FRAMES, Maps, errors_of, quick_presets, rendered, simulated_maps
 
@@ -51,6 +52,21 @@ def test_a_handheld_shot_of_very_small_parallax(shared_data: Path, shared_models
     assert 0.0001 < np.median(errors.ate) < 0.0004
     assert 0.0015 < np.median(errors.r_rpe) < 0.006
     assert 0.008 < result.parallax < 0.015
+
+
+@pytest.mark.slow
+def test_a_zoom_that_nobody_announced(shared_data: Path) -> None:
+    """It goes from 628 to 942 pixels while the camera moves in the hand; with one focal length, half of it moves."""
+    clip = shared_data.parent / "cases" / "zoom_unannounced" / "shot.mp4"
+    if not clip.is_file():
+        pytest.skip(f"the clip {clip} is not there")
+    result = factorsfm.reconstruct(clip, depth=None)
+    shortest, longest = focal_range(result)
+    assert shortest == pytest.approx(628, rel=0.02)
+    assert longest == pytest.approx(942, rel=0.02)
+    assert 0.045 < result.parallax < 0.065
+    assert result.moving is None
+    assert any("Nobody announced this zoom" in note for note in result.notes)
 
 
 @pytest.mark.parametrize("preset", PRESETS)

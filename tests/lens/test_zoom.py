@@ -94,7 +94,7 @@ def test_a_fixed_camera_that_zooms_does_not_travel():
     [("dolly", 0.2, 0.05), ("dolly", 0.1, 0.6), ("dolly", 0.03, 0.05), ("handheld", 0.05, 0.05), ("arc", 0.3, 0.05)],
 )
 def test_a_move_is_no_zoom(motion, parallax, noise_px):
-    """A dolly behind much noise is nearly one: a camera that turns and zooms fits as well."""
+    """Not behind much noise, either."""
     _, result = polished(motion, 1.0, parallax=parallax, noise_px=noise_px, lens="distortion")
     assert len(result.state.log_focal) == 1
     assert result.lens.zoom_std is None
