@@ -76,5 +76,5 @@ class LeftOut:
     def _eliminated(self, normal: Normal, cross: Array) -> tuple[Array, Array]:
         """What the elimination of some points adds to information and gradient."""
         columns = np.flatnonzero(cross.any(axis=(1, 2)))
-        block = cross[columns].reshape(len(columns), -1), columns, slice(0, len(normal.point))
+        block = cross[columns].reshape(len(columns), 3 * cross.shape[1]), columns, slice(0, len(normal.point))
         return reduced(normal, [block], 0.0)[:2]

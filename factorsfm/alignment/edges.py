@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from factorsfm.camera.projection import PIXEL_CENTER
 from factorsfm.support.rotations import exponential
+from factorsfm.support.semidefinite import covariance_of, solution
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -171,10 +172,10 @@ def _step(edges: Edges, axes: Array) -> tuple[Array, float]:
         longer = weight[:, k] * edges.length
         normal += (jacobian * longer[:, None]).T @ jacobian
         gradient += jacobian.T @ (longer * residual[:, k])
-    step = -np.linalg.solve(normal + 1e-9 * np.trace(normal) * np.eye(size), gradient)
+    step = -solution(normal + 1e-9 * np.trace(normal) * np.eye(size), gradient)
     tilt = exponential((step[0] * x + step[1] * y)[None])[0]
     turned = [axis if k == 0 else exponential((step[1 + k] * up)[None])[0] @ axis for k, axis in enumerate(axes)]
-    covariance = edges.frames * np.linalg.inv(information + 1e-9 * np.trace(information) * np.eye(size))
+    covariance = edges.frames * covariance_of(information + 1e-9 * np.trace(information) * np.eye(size))
     std = float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1])))
     return np.array([tilt @ axis for axis in turned]), std
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from factorsfm.camera.projection import PIXEL_CENTER
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.support.errors import InputError
+from factorsfm.support.semidefinite import covariance_of, solution
 
 Array = NDArray[np.float64]
 
@@ -147,19 +148,19 @@ def _at_pixel(away: Array, inverse: Array, distance: Array) -> tuple[float, floa
     scale = max(float(np.median(distance)), 1.0)
     weight = np.exp(-0.5 * (distance / scale) ** 2)
     design = np.column_stack([np.ones(len(away)), away / scale]) if len(away) > _FEWEST else np.ones((len(away), 1))
-    solution = np.zeros(design.shape[1])
+    fit = np.zeros(design.shape[1])
     for _ in range(10):  # Cauchy: a neighbour may be on another surface
         # A slope that would change the depth by half within the neighbourhood needs more than a few tracks.
         prior = np.diag([0.0] + [0.01] * (design.shape[1] - 1))
         normal = (design * weight[:, None]).T @ design + prior
-        solution = np.linalg.solve(normal, design.T @ (weight * inverse))
-        residual = inverse - design @ solution
+        fit = solution(normal, design.T @ (weight * inverse))
+        residual = inverse - design @ fit
         spread = max(1.4826 * float(np.median(np.abs(residual))), 1e-4 * middle)
         weight = np.exp(-0.5 * (distance / scale) ** 2) / (1 + (residual / (2 * spread)) ** 2)
     free = max(float(weight.sum()) - design.shape[1], 0.5)
     variance = max(float(weight @ residual**2) / free, spread**2)
-    leverage = float(np.linalg.inv(normal)[0, 0])
-    value = float(np.clip(solution[0], inverse.min() / 1.5, inverse.max() * 1.5))
+    leverage = float(covariance_of(normal)[0, 0])
+    value = float(np.clip(fit[0], inverse.min() / 1.5, inverse.max() * 1.5))
     return value, _FEW * float(np.sqrt(variance * (1.0 + leverage)))
 
 

@@ -62,7 +62,7 @@ def failure_summary(
     reason: str, frames: Sequence[FrameResult], options: Mapping[str, Any], seconds: Mapping[str, float]
 ) -> dict[str, Any]:
     """The summary of a shot that cannot be reconstructed: with the keys of any other, so that one reader fits both."""
-    numbers = ("parallax", "kind", "control", "imu", "reprojection_error", "observability", "focal_length")
+    numbers = ("parallax", "kind", "control", "imu", "alignment", "reprojection_error", "observability", "focal_length")
     return {
         "program": PROGRAM,
         "version": program_version(),

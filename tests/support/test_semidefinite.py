@@ -84,7 +84,7 @@ def test_what_is_no_number_is_not_known():
 def test_normal_equations_are_solved_in_one_place():
     """Elsewhere only matrices are inverted that no measurement can make singular."""
     elsewhere = {
-        "report/props.py", "support/semidefinite.py", "synthetic/imu.py", "synthetic/room.py", "tracks/tiles.py"
+        "alignment/planes.py", "support/semidefinite.py", "synthetic/imu.py", "synthetic/room.py", "tracks/tiles.py"
     }  # fmt: skip
     package = Path(factorsfm.__file__).parent
     found = {
