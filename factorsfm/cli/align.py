@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from factorsfm.alignment.align import Length, align
-from factorsfm.cli.command import RESULT_FOLDER, Command, write_result
+from factorsfm.cli.command import RESULT_FOLDER, Command, add_shot, write_result
 from factorsfm.cli.progress_line import ProgressLine
 from factorsfm.report.result_folder import check_directory
 from factorsfm.report.thumbnails import retake
@@ -34,12 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--camera-height", type=float, metavar="METRES", help="known height of the first camera above the ground"
     )
-    parser.add_argument(
-        "--footage",
-        type=Path,
-        metavar="VIDEO|FOLDER",
-        help="the shot, of any size with the same aspect ratio (default: the source)",
-    )
+    add_shot(parser)
 
 
 def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:

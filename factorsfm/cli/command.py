@@ -124,6 +124,18 @@ def add_footage(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_shot(parser: argparse.ArgumentParser, *other_names: str) -> None:
+    """Declare where the shot of a finished result is, under `--footage` and other names."""
+    parser.add_argument(
+        "--footage",
+        *other_names,
+        dest="footage",
+        type=Path,
+        metavar="VIDEO|FOLDER",
+        help="the shot, of any size with the same aspect ratio (default: the source)",
+    )
+
+
 def add_imu(parser: argparse.ArgumentParser) -> None:
     """Declare the recording of an IMU."""
     parser.add_argument(

@@ -6,7 +6,7 @@ import argparse
 from dataclasses import fields
 from pathlib import Path
 
-from factorsfm.cli.command import Command
+from factorsfm.cli.command import Command, add_shot
 from factorsfm.cli.progress_line import ProgressLine
 from factorsfm.export.formats import FORMATS, export
 from factorsfm.export.options import ExportOptions, UpAxis
@@ -35,12 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--up-axis", choices=[axis.value for axis in UpAxis], help="in the first frame (default: the format's)"
     )
     parser.add_argument("--scale", type=float, help="exported length of one unit (default: the format's)")
-    parser.add_argument(
-        "--footage",
-        type=Path,
-        metavar="VIDEO|FOLDER",
-        help="the shot, of any size with the same aspect ratio (default: the source)",
-    )
+    add_shot(parser)
 
 
 def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from factorsfm.cli.command import Command
+from factorsfm.cli.command import Command, add_shot
 from factorsfm.cli.progress_line import ProgressLine
 from factorsfm.report.overlay import CODECS, LAYERS, write_overlay
 from factorsfm.result.reading import read_result
@@ -23,14 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--output", type=Path, required=True, metavar="FILE", help=f"the video to write ({', '.join(CODECS)})"
     )
-    parser.add_argument(
-        "--footage",
-        "--source",
-        dest="footage",
-        type=Path,
-        metavar="VIDEO|FOLDER",
-        help="the shot, of any size with the same aspect ratio (default: the source)",
-    )
+    add_shot(parser, "--source")
     parser.add_argument("--hide", nargs="+", choices=LAYERS, default=[], help="what not to draw")
 
 
