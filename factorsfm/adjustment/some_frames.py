@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,13 +22,7 @@ def some_frames(state: State, observations: Observations) -> tuple[Index, State,
     seen = np.bincount(observations.point[keep], minlength=len(state.bearing)) >= 2
     keep &= seen[observations.point]
     points = np.flatnonzero(seen)
-    part = replace(
-        state.of(points),
-        rotation=state.rotation[frames],
-        translation=state.translation[frames],
-        group=state.group[frames],
-        world=int(np.searchsorted(frames, state.world)),
-    )
+    part = state.of(points).in_frames(frames)
     frame, point = observations.frame[keep], observations.point[keep]
     frame, point = np.searchsorted(frames, frame), np.searchsorted(points, point)
     return frames, part, observations.at(keep, frame=frame, point=point)

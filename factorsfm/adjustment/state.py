@@ -64,6 +64,16 @@ class State:
         """The same with some of the points, as `Observations.of` numbers them."""
         return replace(self, bearing=self.bearing[points], inverse_distance=self.inverse_distance[points])
 
+    def in_frames(self, frames: Index) -> State:
+        """The same with some of the frames (ascending), that of the world among them."""
+        return replace(
+            self,
+            rotation=self.rotation[frames],
+            translation=self.translation[frames],
+            group=self.group[frames],
+            world=int(np.searchsorted(frames, self.world)),
+        )
+
     def seen_from(self, frame: int) -> State:
         """The same with another camera as the world."""
         if frame == self.world:

@@ -7,7 +7,7 @@ neighbours without visible translation are judged again together.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import groupby
 from typing import TypeVar
 
@@ -93,15 +93,7 @@ def _kind_of_frames(solved: BundleAdjustment, first: int, end: int, options: Pol
     points, point = np.unique(o.point[rows], return_inverse=True)
     if not len(points):
         return ShotKind.STATIC
-    state = solved.state.seen_from(first).of(points)
-    frames = slice(first, end)
-    part = replace(
-        state,
-        rotation=state.rotation[frames],
-        translation=state.translation[frames],
-        group=state.group[frames],
-        world=0,
-    )
+    part = solved.state.seen_from(first).of(points).in_frames(np.arange(first, end))
     few = o.at(rows, frame=o.frame[rows] - first, point=point)
     alone = BundleAdjustment(part, few, options, solved.errors)
     alone.solve(_ITERATIONS)
