@@ -31,14 +31,32 @@ def live_covariance(pose: tuple[Array, Array], on_map: Array, keyframes: Sequenc
     on_map = on_map + bent**2 * np.eye(6)
     if len(keyframes) < 2:
         return on_map
-    keyframe = keyframes[-1]
+    return on_map + _carried(keyframes[-1], pose)
+
+
+def window_covariance(pose: tuple[Array, Array], given: Array, constant: Sequence[MappedImage]) -> Array:
+    """(6, 6) of a keyframe's pose, the uncertainty of the constant keyframes included.
+
+    The errors of constant keyframes are nearly the same, so that all that hangs on them moves with them as one body.
+
+    Args:
+        pose: rotation (3, 3) and translation (3,), cam_from_world.
+        given: (6, 6) what is uncertain where the constant keyframes are exact.
+        constant: keyframes that the graph holds; the first of a map, which is the world, is without error.
+    """
+    carried = [_carried(keyframe, pose) for keyframe in constant if keyframe.covariance is not None]
+    return given + np.sum(carried, axis=0) / len(constant) if carried else given
+
+
+def _carried(keyframe: MappedImage, pose: tuple[Array, Array]) -> Array:
+    """(6, 6) of what is uncertain in a keyframe's pose, in the camera of another pose that moves with it."""
     assert keyframe.covariance is not None
-    turn = rotation @ keyframe.pose[0].T
-    shift = translation - turn @ keyframe.pose[1]
+    turn = pose[0] @ keyframe.pose[0].T
+    shift = pose[1] - turn @ keyframe.pose[1]
     adjoint = np.zeros((6, 6))
     adjoint[:3, :3] = adjoint[3:, 3:] = turn
     adjoint[3:, :3] = cross_matrices(shift[None])[0] @ turn
-    return on_map + adjoint @ keyframe.covariance @ adjoint.T
+    return adjoint @ keyframe.covariance @ adjoint.T
 
 
 def _places(keyframes: Sequence[MappedImage], center: Array) -> int:
