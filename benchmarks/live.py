@@ -115,8 +115,14 @@ def sigmas(
         turn = cv2.Rodrigues(found_rotations[k].T @ rotations[k])[0].ravel()
         move = found_rotations[k].T @ (scale * centers[k] - found_centers[k])
         parts = ((turn, covariance[:3, :3]), (move, covariance[3:, 3:]))
-        found[k] = max(np.sqrt(error @ np.linalg.solve(c, error)) for error, c in parts)
+        found[k] = max(_mahalanobis(error, c) for error, c in parts)
     return found
+
+
+def _mahalanobis(error: Array, covariance: Array) -> float:
+    if not covariance.any():  # the world itself: the first frame, and what repeats it
+        return float(np.inf) if error.any() else 0.0
+    return float(np.sqrt(error @ np.linalg.solve(covariance, error)))
 
 
 def relative_poses(rotations: Array, centers: Array) -> tuple[Array, Array]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,15 +17,25 @@ _YOUNG_ERROR = 0.8  # relative, of a map that only the prior has shaped; falls w
 _SAME_PLACE = 0.02  # of the camera's displacement: keyframes nearer than that tell no more of the map's shape than one
 
 
-def live_covariance(pose: tuple[Array, Array], on_map: Array, keyframes: Sequence[MappedImage]) -> Array:
+def live_covariance(
+    pose: tuple[Array, Array],
+    on_map: Array,
+    keyframes: Sequence[MappedImage],
+    doubted_from: tuple[Array, Array] | None = None,
+) -> Array:
     """(6, 6) of a pose that was just registered (`FrameResult.covariance`).
 
     Args:
         pose: rotation (3, 3) and translation (3,), cam_from_world.
         on_map: (6, 6) what is uncertain where the map is exact.
         keyframes: those whose covariance the graph has given: what the map itself leaves open.
+        doubted_from: the pose beside it in time, where the image is rough: the whole step from there is in doubt.
     """
     rotation, translation = pose
+    if doubted_from is not None:
+        turn = rotation @ doubted_from[0].T
+        step = np.concatenate([cv2.Rodrigues(turn)[0].ravel(), translation - turn @ doubted_from[1]])
+        on_map = on_map + np.outer(step, step)
     # What linearised covariances do not know of a young map: that its whole shape is still a guess.
     places = _places(keyframes, -rotation.T @ translation)
     bent = _YOUNG_ERROR * float(np.linalg.norm(translation)) / places**2
