@@ -16,13 +16,13 @@ from factorsfm.graph.added_factors import AddedFactors
 from factorsfm.graph.factors_on_poses import FactorsOnPoses
 from factorsfm.lens.camera_model import distortion_of
 from factorsfm.lens.rolling_shutter import Recording
+from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.mapping.mapper import Mapper
 from factorsfm.polish.polish import polish
 from factorsfm.polish.polished import Polished
 from factorsfm.priors.depth import DepthPrior
 from factorsfm.result.assembly import assemble
 from factorsfm.result.reconstruction import Reconstruction
-from factorsfm.streaming.footage import Footage
 from factorsfm.streaming.frame_update import SeenFrame
 from factorsfm.streaming.imu_result import add_imu
 from factorsfm.streaming.imu_source import FramePoses, ImuSource
@@ -40,16 +40,18 @@ class EndedShot:
     """What a stream knows when the last frame has come.
 
     Attributes:
-        frames: as they came; mapper: has an image of each, registered on the map as it is at last.
+        frames: as they came; images: of these, registered on the map as it is at last; mapper: has made it.
         colors: (n, 3) RGB by track id.
         camera: the lens of the mapper's images; lens_given: whether it is known, and no guess.
         depth: the prior; without_depth: why it failed, by the frame's index.
-        control: what is known beforehand; imu: beside the stream; footage: how the frames were recorded.
+        control: what is known beforehand; imu: beside the stream.
+        times: (n,) when the frames were recorded, in usual intervals; interval: of these, seconds, 0 if unknown.
         seconds: of the stages so far; that of the polish is added.
         suspects: ids of the tracks that count only where they agree with the others.
     """
 
     frames: Sequence[SeenFrame]
+    images: list[MappedImage]
     mapper: Mapper
     colors: NDArray[np.uint8]
     camera: pycolmap.Camera
@@ -58,7 +60,8 @@ class EndedShot:
     without_depth: Mapping[int, str]
     control: Control | None
     imu: ImuSource | None
-    footage: Footage
+    times: Array
+    interval: float
     options: Options
     seconds: StageSeconds
     suspects: NDArray[np.int64]
@@ -66,9 +69,9 @@ class EndedShot:
     def reconstruction(self, progress: Progress | None) -> Reconstruction:
         """Polish over all frames and tracks; errors as in `Stream.finish`."""
         control = self._located_control()
-        registered = sum(image.registered for image in self.mapper.images)
+        registered = sum(image.registered for image in self.images)
         if registered < 2:
-            worst = next((i for i in self.mapper.images if not i.registered), self.mapper.images[0])
+            worst = next((i for i in self.images if not i.registered), self.images[0])
             raise ReconstructionError(
                 f"{registered} of {len(self.frames)} frames registered, at least 2 needed; "
                 f"frame {self.frames[worst.tracks.position].index}: {worst.message}"
@@ -78,17 +81,17 @@ class EndedShot:
             polished = self._polished(control, factors, progress)
         result = assemble(
             polished,
-            self.mapper.images,
+            self.images,
             self.frames,
             self.colors,
             self.camera,
             lens_given=self.lens_given,
             depth_kind=None if self.depth is None else self.depth.kind,
             seconds=dict(self.seconds),
-            interval=self.footage.interval(self.frames),
+            interval=self.interval,
             options=self.options.to_dict(),
         )
-        if lost := lost_frames(result.frames, self.mapper.images):
+        if lost := lost_frames(result.frames, self.images):
             result.notes.append(lost)
         if len(self.suspects):
             agree = int(np.isin(polished.tracks, self.suspects).sum())
@@ -112,7 +115,7 @@ class EndedShot:
         self, control: LocatedControl | None, factors: ShotFactors | None, progress: Progress | None
     ) -> Polished:
         return polish(
-            self.mapper.images,
+            self.images,
             self.mapper.points.all(),
             np.array([self.mapper.focal]),
             self.options,
@@ -134,20 +137,18 @@ class EndedShot:
             return None
         focal = np.array([self.camera.focal_length_x, self.camera.focal_length_y])
         size = (self.camera.width, self.camera.height)
-        return Recording(*size, self.footage.times(self.frames), focal / focal.mean())
+        return Recording(*size, self.times, focal / focal.mean())
 
     def _factors(self) -> ShotFactors | None:
         """Those that were added to the live graph, with the poses that these are beside."""
         added = self.mapper.additions.everything()
         if not added.numbers:
             return None
-        return self._beside(
-            added, {image.tracks.position: image.pose for image in self.mapper.images if image.registered}
-        )
+        return self._beside(added, {image.tracks.position: image.pose for image in self.images if image.registered})
 
     def _beside(self, added: AddedFactors, poses: dict[int, tuple[Array, Array]]) -> ShotFactors:
         """Factors in the world of some poses, which are there by position."""
-        numbers, contents = [image.tracks.frame for image in self.mapper.images], self.mapper.contents()
+        numbers, contents = [image.tracks.frame for image in self.images], self.mapper.contents()
         return ShotFactors(
             frames=[position for position in poses if numbers[position] in added.frames],
             tracks=np.array(sorted(added.tracks), np.int64),
@@ -163,7 +164,7 @@ class EndedShot:
         if self.mapper.refines_focal and (polished.lens is None or not polished.lens.determined):
             self.imu.reason = "the lens is not known, and the shot does not determine it"
             return None
-        images, rows = self.mapper.images, polished.frames
+        images, rows = self.images, polished.frames
         poses = FramePoses.none(len(images))
         poses.rotation[rows], poses.translation[rows] = polished.state.rotation, polished.state.translation
         poses.covariance[rows] = polished.covariance
