@@ -1,0 +1,239 @@
+"""Which constants matter: each at 0.7 and 1.4 times its value, on a slice of the shots.
+
+    python -m benchmarks.sensitivity --data FOLDER [--rooms mapping graph] [--only NAME] [--jobs 2]
+
+Measured are the numbers that the modules of the product name in capitals, and those of its options; a pair or triple of
+numbers changes as a whole. Every measurement runs in a process of its own and is kept in sensitivity.json beside the
+table, so that an interrupted run goes on where it stopped.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import importlib
+import json
+import multiprocessing
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, fields, replace
+from itertools import islice
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+
+import factorsfm
+from benchmarks.inputs import open_prior, open_shot
+from benchmarks.markdown import table
+from benchmarks.plan import FULL
+from benchmarks.run import HERE, machine
+from factorsfm import MaskFolder, Options, ReconstructionError, Stream
+from factorsfm.evaluation.metrics import auc, trajectory_errors
+from factorsfm.graph.keyframe_graph import KeyframeGraph
+from factorsfm.graph.process import GraphProcess
+from factorsfm.streaming import stream as streaming
+from factorsfm.support.similarity import pose_arrays
+
+RESULTS = Path(__file__).parent / "results"
+SHOTS = ("d03_livingroom_handheld", "d08_arena_pedestal")
+FRAMES = 32  # of each shot: young maps are where settings matter most
+ROOMS = (
+    "tracks", "priors", "adjustment", "graph", "motion", "mapping", "lens", "polish", "streaming", "support", "options",
+)  # fmt: skip
+FACTORS = (0.7, 1.4)
+MUCH = 3.0  # points of a column
+COLUMNS = (("ATE", 0.002), ("ATE", 0.02), ("T-RPE", 0.001), ("T-RPE", 0.005), ("R-RPE", 0.02), ("R-RPE", 0.1))
+
+Scores = dict[str, list[float]]
+
+
+@dataclass(frozen=True, slots=True)
+class Constant:
+    """A number of the product.
+
+    Attributes:
+        place: module below `factorsfm`, or the options it belongs to; name: in there.
+        value: a number or several.
+    """
+
+    place: str
+    name: str
+    value: float | tuple[float, ...]
+
+    @property
+    def key(self) -> str:
+        """Names it in the records."""
+        return f"{self.place}:{self.name}"
+
+    def changed(self, factor: float) -> float | tuple[float, ...]:
+        """The value times a factor; a whole number stays one, and becomes another."""
+        if isinstance(self.value, tuple):
+            return tuple(_times(value, factor) for value in self.value)
+        return _times(self.value, factor)
+
+
+def _times(value: float, factor: float) -> float:
+    if isinstance(value, int):
+        return max(0, min(round(factor * value), value - 1) if factor < 1.0 else max(round(factor * value), value + 1))
+    return factor * value
+
+
+def constants(room: str) -> Iterator[Constant]:
+    """Those of a room, or the options."""
+    if room == "options":
+        for part in ("tracker", "mapper", "polish"):
+            values = getattr(Options(), part)
+            for field in fields(values):
+                if _is_number(value := getattr(values, field.name)):
+                    yield Constant(part, field.name, value)
+        return
+    package = Path(factorsfm.__file__).parent
+    for path in sorted((package / room).glob("*.py")):
+        for name, value in _assigned(ast.parse(path.read_text())):
+            if name.isupper() and (_is_number(value) or (isinstance(value, tuple) and all(map(_is_number, value)))):
+                yield Constant(f"{room}.{path.stem}", name, value)
+
+
+def _assigned(module: ast.Module) -> Iterator[tuple[str, Any]]:
+    """Names and values that a module assigns as plain literals."""
+    for statement in module.body:
+        if not isinstance(statement, ast.Assign):
+            continue
+        try:
+            value = ast.literal_eval(statement.value)
+        except ValueError:
+            continue
+        target = statement.targets[0]
+        if isinstance(target, ast.Tuple):
+            yield from zip((name.id for name in target.elts if isinstance(name, ast.Name)), value, strict=True)
+        elif isinstance(target, ast.Name):
+            yield target.id, value
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+class _GraphHere(GraphProcess):
+    """The graph in this process, where the constant is changed."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._graph = KeyframeGraph()
+
+    def ask(self, update: Any, subject: Any) -> Any:
+        """As there."""
+        if self._anew:
+            self._graph, self._anew = KeyframeGraph(), False
+        return update(subject, self._graph)
+
+
+def measure(constant: Constant | None, factor: float, data: Path, shots: tuple[str, ...]) -> Scores:
+    """Columns in percent, pooled over the shots, of the live and of the polished poses."""
+    options = Options()
+    if constant is not None and "." not in constant.place:
+        part = replace(getattr(options, constant.place), **{constant.name: constant.changed(factor)})
+        options = replace(options, **{constant.place: part})
+    elif constant is not None:
+        home = importlib.import_module(f"factorsfm.{constant.place}")
+        value = getattr(home, constant.name)
+        for name, module in list(sys.modules.items()):
+            if name.startswith("factorsfm") and getattr(module, constant.name, None) is value:
+                setattr(module, constant.name, constant.changed(factor))
+    errors: dict[str, list[Any]] = {"graph": [], "polished": []}
+    with patch.object(streaming, "GraphProcess", _GraphHere):
+        for shot in shots:
+            for name, found in _errors(shot, data, options).items():
+                errors[name].append((found.ate, found.t_rpe, found.r_rpe))
+    kinds = ("ATE", "T-RPE", "R-RPE")
+    pooled = {
+        name: dict(zip(kinds, map(np.concatenate, zip(*found, strict=True)), strict=True))
+        for name, found in errors.items()
+    }
+    return {name: [auc(found[kind], limit) for kind, limit in COLUMNS] for name, found in pooled.items()}
+
+
+def _errors(name: str, data: Path, options: Options) -> dict[str, Any]:
+    shot = open_shot(data, name, FULL)
+    depth = open_prior("tcmonodepth", shot, data, data.parent / "models", HERE / "cache")
+    masks = MaskFolder(shot.masks) if shot.masks is not None else None
+    with Stream(shot.camera, depth=depth, masks=masks, options=options) as stream:
+        for frame in islice(shot.frames(), FRAMES):
+            stream.push(frame)
+        poses = {"graph": stream.trajectory()}
+        try:
+            poses["polished"] = [frame.cam_from_world for frame in stream.finish().frames]
+        except ReconstructionError:
+            poses["polished"] = [None] * FRAMES
+    true = shot.rotations[:FRAMES], shot.centers[:FRAMES]
+    return {kind: trajectory_errors(*pose_arrays(found), *true) for kind, found in poses.items()}
+
+
+def report(records: dict[str, Scores], shots: tuple[str, ...]) -> str:
+    """The constants that matter, the worst first, and how many do not."""
+    base = records["unchanged"]
+    rows: list[tuple[float, list[object]]] = []
+    for key in sorted({key.rpartition(" ")[0] for key in records} - {""}):
+        changes = [
+            [float(np.min(np.subtract(records[f"{key} {f:g}"][name], base[name]))) for name in base]
+            for f in FACTORS
+            if f"{key} {f:g}" in records
+        ]
+        worst = min(map(min, changes))
+        rows.append((worst, [f"`{key}`", *(f"{live:+.1f} / {polished:+.1f}" for live, polished in changes)]))
+    rows.sort(key=lambda row: row[0])
+    matter = [row for worst, row in rows if worst < -MUCH]
+    return "\n\n".join(
+        [
+            "# Sensitivity",
+            f"`python -m benchmarks.sensitivity --data FOLDER`. Machine: {machine()}. The first {FRAMES} frames of "
+            f"{', '.join(shots)}, TCMonoDepth at the keyframes, known lens. Of {len(rows)} constants, changed one at a "
+            f"time, {len(matter)} cost more than {MUCH:g} points in a pooled column.",
+            "Unchanged: "
+            + "; ".join(f"{name} {' / '.join(f'{value:.1f}' for value in found)}" for name, found in base.items())
+            + ". The largest loss in any of these columns, of the live and of the polished poses:",
+            table(["constant", *(f"times {factor:g}: live / polished" for factor in FACTORS)], [r for _, r in rows]),
+        ]
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.sensitivity", description=__doc__)
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--rooms", nargs="+", default=ROOMS, choices=ROOMS, metavar="ROOM")
+    parser.add_argument("--only", default="", metavar="NAME", help="only constants whose key contains this")
+    parser.add_argument("--shots", nargs="+", default=SHOTS, metavar="NAME")
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--output", type=Path, default=RESULTS)
+    arguments = parser.parse_args()
+    kept, shots = arguments.output / "sensitivity.json", tuple(arguments.shots)
+    records: dict[str, Scores] = json.loads(kept.read_text()) if kept.exists() else {}
+    plan: dict[str, tuple[Constant | None, float]] = {"unchanged": (None, 1.0)}
+    for room in arguments.rooms:
+        for constant in constants(room):
+            if arguments.only in constant.key:
+                plan |= {f"{constant.key} {factor:g}": (constant, factor) for factor in FACTORS}
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(arguments.jobs, spawn, max_tasks_per_child=1) as pool:
+        jobs = {
+            key: pool.submit(measure, constant, factor, arguments.data, shots)
+            for key, (constant, factor) in plan.items()
+            if key not in records
+        }
+        for key, job in jobs.items():
+            try:
+                records[key] = job.result()
+            except Exception as error:  # a constant that the product cannot do with
+                print(key, error, flush=True)
+                records[key] = {name: [0.0] * len(COLUMNS) for name in ("graph", "polished")}
+            kept.write_text(json.dumps(records, indent=1))
+            print(key, records[key], flush=True)
+    (arguments.output / "SENSITIVITY.md").write_text(report(records, shots) + "\n")
+    print(report(records, shots))
+
+
+if __name__ == "__main__":
+    main()
