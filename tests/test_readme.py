@@ -34,6 +34,7 @@ DESCRIBED = {
     "stream": ["command-line.md", "streaming.md"],
     "batch": ["command-line.md", "films.md"],
     "extend": ["image-sets.md"],
+    "view": ["align.md"],
     "align": ["align.md"],
     "export": ["export.md"],
     "overlay": ["export.md"],
@@ -132,7 +133,7 @@ def test_command(block: Block, place: Path, monkeypatch: pytest.MonkeyPatch) -> 
             words.pop()
         assert words[0] == "factorsfm"
         assert cli.main(words[1:]) == 0
-        output = place / words[words.index("--output") + 1]
+        output = place / words[words.index("--output" if "--output" in words else words[1]) + 1]
         if words[1] in ("reconstruct", "stream"):
             own = {"objects.json"} if "--objects" in words else set()
             assert {path.name for path in output.iterdir()} == FILES | own
@@ -251,7 +252,7 @@ def test_no_page_names_an_option_that_is_not_there(capsys: pytest.CaptureFixture
 def test_every_command_value_and_status_is_described() -> None:
     page = text_of(DOCS / "command-line.md")
     assert [row["command"].strip("`") for row in table(page, "command")] == [
-        "reconstruct", "stream", "batch", "extend", "align", "export", "overlay", "demo",
+        "reconstruct", "stream", "batch", "extend", "view", "align", "export", "overlay", "demo",
     ]  # fmt: skip
     assert set(DESCRIBED) == {row["command"].strip("`") for row in table(page, "command")}
     for column, values in (("kind", ShotKind), ("status", FrameStatus), ("preset", PRESETS)):

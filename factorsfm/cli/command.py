@@ -136,6 +136,13 @@ def add_shot(parser: argparse.ArgumentParser, *other_names: str) -> None:
     )
 
 
+def add_align(parser: argparse.ArgumentParser) -> None:
+    """Declare whether results are aligned."""
+    parser.add_argument(
+        "--align", action="store_true", help="the result stands on its ground, as factorsfm align makes it"
+    )
+
+
 def add_imu(parser: argparse.ArgumentParser) -> None:
     """Declare the recording of an IMU."""
     parser.add_argument(

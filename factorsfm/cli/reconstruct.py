@@ -11,6 +11,7 @@ from factorsfm.alignment.align import align
 from factorsfm.camera.files import open_camera
 from factorsfm.cli.command import (
     Command,
+    add_align,
     add_footage,
     add_imu,
     add_method,
@@ -53,9 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE.json",
         help="known poses, points, distances and heights: the result is in their world and unit",
     )
-    parser.add_argument(
-        "--align", action="store_true", help="the result stands on its ground, as factorsfm align makes it"
-    )
+    add_align(parser)
     add_imu(parser)
     parser.add_argument(
         "--work",

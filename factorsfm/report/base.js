@@ -11,6 +11,7 @@ const roundLength = most => [5, 2, 1].map(f => f * 10 ** Math.floor(Math.log10(m
 const frameCount = data.frame.length, last = Math.max(frameCount - 1, 1);
 const solved = Boolean(data.positions && data.positions.length);
 const hasTracks = solved && data.tracks.start[frameCount] > 0;
+const alignable = hasTracks && data.survey !== "world";
 const hasThumbnails = data.thumbnail.some(Boolean);
 
 // The frame that is shown, and who follows it.

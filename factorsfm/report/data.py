@@ -10,6 +10,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from factorsfm.alignment.align import survey
 from factorsfm.report.charts import charts
 from factorsfm.report.geometry import Tracks, median_prior_residuals, scene, tracks
 from factorsfm.report.props import place_props
@@ -35,6 +36,8 @@ def reconstruction_data(reconstruction: Reconstruction) -> dict[str, Any]:
         "unit": unit,
         "width": camera.width,
         "height": camera.height,
+        "sizes": [(lens.width, lens.height) for lens in map(reconstruction.camera_of, reconstruction.frames)],
+        "survey": survey(reconstruction),
         "focals": [reconstruction.camera_of(frame).focal_length_x for frame in reconstruction.registered],
         "points": _base64(view.points, "<f4"),
         "colors": _base64(view.colors, "u1"),

@@ -66,10 +66,15 @@ function drawMoving(prepared, position) {
 function drawFootage() {
   const prepared = prepare(byId("footage"));
   if (!prepared) return;
-  const {context, width, height, ratio} = prepared, position = seek.position;
+  const position = seek.position;
   drawPicture(prepared, position, 1);
   if (moving && byId("show_moving").checked) drawMoving(prepared, position);
-  if (!hasTracks) return;
+  if (hasTracks) drawTracks(prepared, position);
+  drawPicks(prepared, position);
+}
+
+function drawTracks(prepared, position) {
+  const {context, width, height, ratio} = prepared;
   const x = o => tracks.place[2 * o] / 65535 * width, y = o => tracks.place[2 * o + 1] / 65535 * height;
   if (byId("show_tracks").checked) drawTails(prepared, position, tracks.start, tracks.point, tracks.place, "#ffffffb0");
   const pixel = magnified * width / data.width / data.tracks.residual_steps, side = 3 * ratio;

@@ -24,7 +24,7 @@ from factorsfm.result.verdict import Grade, verdict_of
 from factorsfm.support.json_text import json_text
 from factorsfm.support.program import PROGRAM, program_version
 
-_SCRIPTS = ("base.js", "view.js", "footage.js", "charts.js", "page.js")
+_SCRIPTS = ("base.js", "view.js", "footage.js", "align.js", "charts.js", "page.js")
 _LIBRARIES = ("gtsam", "pycolmap", "opencv-python-headless", "onnxruntime", "numpy")
 
 
@@ -81,6 +81,7 @@ def _document(
         explanation=escape(explanation),
         notes="".join(f"<li>{escape(note)}</li>" for note in notes),
         facts="".join(f"<div><dt>{key}</dt><dd>{escape(str(value))}</dd></div>" for key, value in facts.items()),
+        align=packaged("factorsfm.report", "align.html"),
         statuses=_statuses(frames),
         timings=_table({stage: f"{value:.2f} s" for stage, value in with_total(seconds).items()}),
         versions=_table(_versions()),
@@ -89,7 +90,8 @@ def _document(
         data=json_text(data, indent=None).replace("</", "<\\/"),
         script="".join(packaged("factorsfm.report", name) for name in _SCRIPTS),
     )
-    return document(f"{source} – {PROGRAM} report" if source else f"{PROGRAM} report", body, scripted=True)
+    title = f"{source} – {PROGRAM} report" if source else f"{PROGRAM} report"
+    return document(title, body, styles=packaged("factorsfm.report", "align.css"), scripted=True)
 
 
 def _facts(reconstruction: Reconstruction) -> dict[str, Any]:

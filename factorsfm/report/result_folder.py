@@ -203,5 +203,17 @@ def is_earlier_result(directory: Path) -> bool:
     return isinstance(content, dict) and content.get("program") == PROGRAM
 
 
+def report_of(directory: Path) -> Path:
+    """The report in a result folder, absolute.
+
+    Raises:
+        InputError: the folder holds no result, or one that is incomplete.
+    """
+    page = directory.absolute() / "report.html"
+    if not (is_earlier_result(directory) and page.is_file()):
+        raise InputError(f"{directory} holds no report of factorsfm; a folder that it has written is expected")
+    return page
+
+
 def _unwritable(directory: Path, error: OSError) -> InputError:
     return InputError(f"cannot write to the output folder {directory}: {error.strerror or error}")
