@@ -256,7 +256,10 @@ function keyInPicture(event) {
 }
 
 function startAligning() {
-  const footage = byId("footage"), crossAt = event => [event.offsetX / footage.clientWidth, event.offsetY / footage.clientHeight].map(at => clamp(at, 0, 1));
+  const footage = byId("footage"), crossAt = event => {
+    const box = footage.getBoundingClientRect();
+    return [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height].map(at => clamp(at, 0, 1));
+  };
   document.querySelectorAll("[data-pick]").forEach(addPickControl);
   for (const input of document.querySelectorAll("#align_section input")) input.addEventListener("input", showAlignment);
   byId("copy").addEventListener("click", copyCommand);

@@ -1,5 +1,6 @@
 """Headless Chromium, driven through its debugging pipe: real keys and pointers, and what the page asks and says."""
 
+import base64
 import json
 import os
 import select
@@ -92,6 +93,12 @@ class Chromium:
         """At a place of the window."""
         for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
             self._ask("Input.dispatchMouseEvent", type=kind, button="left", buttons=1, clickCount=1, x=x, y=y)
+
+    def screenshot(self, area: tuple[float, float, float, float]) -> bytes:
+        """JPEG of a part of the page, also of what the window does not show: left, top, width, height."""
+        clip = {**dict(zip(("x", "y", "width", "height"), area, strict=True)), "scale": 0.8}
+        answer = self._ask("Page.captureScreenshot", format="jpeg", quality=75, captureBeyondViewport=True, clip=clip)
+        return base64.b64decode(answer["data"])
 
     def close(self) -> None:
         os.close(self._commands)  # Chromium ends with its pipe
