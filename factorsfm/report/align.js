@@ -56,6 +56,7 @@ function command() {
   const sigma = Number(byId("sigma").value);
   if (scale === "distance") words.push("--distance", pixelText(from), pixelText(to), byId("metres").value + (sigma > 0 ? `,${byId("sigma").value}` : ""));
   if (scale === "height") words.push("--camera-height", byId("height").value);
+  if (data.footage) words.push("--footage", data.footage);
   return words.map(String).map(quoted).join(" ");
 }
 
@@ -198,7 +199,7 @@ function drawPicks({context, width, height, ratio}, position) {
   for (const [name, pick] of Object.entries(aligning.picks))
     if (pick.position === position) drawMark(context, ratio, [pick.u * width, pick.v * height], marks[name]);
   if (!aligning.waiting || !aligning.cross) return;
-  const [u, v] = aligning.cross, picture = pictureOf(position), side = 0.34 * Math.min(width, height);
+  const [u, v] = aligning.cross, picture = pictureOf(position), side = 0.42 * Math.min(width, height);
   if (picture) {
     const x = u < 0.5 ? width - side : 0, y = v < 0.5 ? height - side : 0, part = side / MAGNIFIED;
     context.save();
@@ -209,6 +210,9 @@ function drawPicks({context, width, height, ratio}, position) {
     context.setTransform(MAGNIFIED, 0, 0, MAGNIFIED, x - MAGNIFIED * (u * width - part / 2), y - MAGNIFIED * (v * height - part / 2));
     context.drawImage(picture, 0, 0, width, height);
     context.restore();
+    context.strokeStyle = css("--card");
+    context.lineWidth = 2 * ratio;
+    context.strokeRect(x, y, side, side);
     drawMark(context, ratio, [x + side / 2, y + side / 2], "");
   }
   drawMark(context, ratio, [u * width, v * height], marks[aligning.waiting]);

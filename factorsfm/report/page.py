@@ -11,7 +11,7 @@ from string import Template
 from typing import Any
 
 from factorsfm.report.data import frames_data, reconstruction_data
-from factorsfm.report.document import document, packaged
+from factorsfm.report.document import document, packaged, script_text
 from factorsfm.report.wording import (
     explanation,
     failure_sentence,
@@ -21,7 +21,6 @@ from factorsfm.report.wording import (
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.result.summary import focal_range, with_total
 from factorsfm.result.verdict import Grade, verdict_of
-from factorsfm.support.json_text import json_text
 from factorsfm.support.program import PROGRAM, program_version
 
 _SCRIPTS = ("base.js", "view.js", "footage.js", "align.js", "charts.js", "page.js")
@@ -86,8 +85,7 @@ def _document(
         timings=_table({stage: f"{value:.2f} s" for stage, value in with_total(seconds).items()}),
         versions=_table(_versions()),
         options=_table(_flat(options)),
-        # the browser takes "</" for the end of the script element
-        data=json_text(data, indent=None).replace("</", "<\\/"),
+        data=script_text(data),
         script="".join(packaged("factorsfm.report", name) for name in _SCRIPTS),
     )
     title = f"{source} – {PROGRAM} report" if source else f"{PROGRAM} report"

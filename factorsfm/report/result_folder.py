@@ -24,8 +24,17 @@ from factorsfm.support.json_reading import read_json
 from factorsfm.support.json_text import json_text
 from factorsfm.support.program import PROGRAM
 
-# Whatever an earlier result may have left besides summary.json; picture.png is drawn by the demo.
-_ENTRIES = ("trajectory.tum", "colmap", "points.ply", "objects.json", "moving.json", "report.html", "picture.png")
+# Whatever an earlier result may have left besides summary.json; picture.png is drawn by the demo, view.html by `view`.
+_ENTRIES = (
+    "trajectory.tum",
+    "colmap",
+    "points.ply",
+    "objects.json",
+    "moving.json",
+    "report.html",
+    "view.html",
+    "picture.png",
+)
 _SUMMARY = "summary.json"
 _PARTS = "part-[0-9][0-9][0-9]*"  # folders of the other parts of an image set
 _REPLACING = f".{PROGRAM}-replacing-"  # begins the name of the folder in which a result waits that replaces another

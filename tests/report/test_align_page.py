@@ -164,6 +164,8 @@ def test_keys_pick_and_leave(page: Page) -> None:
     assert page.run("aligning.waiting") is None
     page.press("#footage", "ArrowRight")
     assert page.run("seek.position") == 2
+    page.run("data.footage = '/moved/the shot.mp4'; showAlignment()")
+    assert page.command()[-2:] == ["--footage", "/moved/the shot.mp4"]
     page.run("byId('copy').click()")
     assert page.text("align_status") == "Copied."
     assert page.run("getSelection().toString()") == page.text("command")
