@@ -45,6 +45,7 @@ function missing() {
   if (axis && !origin) return "A point along x needs an origin.";
   if (scale === "distance" && !(from && to)) return "Pick both ends of the distance.";
   if (scale !== "kept" && !(Number(byId(scale === "distance" ? "metres" : "height").value) > 0)) return `Type the ${scale === "distance" ? "distance" : "height"} in metres.`;
+  if (scale === "distance" && !byId("sigma").checkValidity()) return "The standard deviation is 0 metres or more.";
   return "";
 }
 
@@ -268,6 +269,7 @@ function startAligning() {
   for (const input of document.querySelectorAll("#align_section input")) input.addEventListener("input", showAlignment);
   byId("copy").addEventListener("click", copyCommand);
   footage.tabIndex = 0;
+  footage.setAttribute("aria-label", `${footage.getAttribute("aria-label")}; arrow keys go through the frames, or move the cross of a pick`);
   footage.addEventListener("keydown", keyInPicture);
   footage.addEventListener("pointerdown", event => { if (aligning.waiting) footage.setPointerCapture(event.pointerId); });
   for (const name of ["pointerdown", "pointermove"]) footage.addEventListener(name, event => {

@@ -91,6 +91,8 @@ def test_picks_in_the_picture_give_origin_axis_and_unit(page: Page) -> None:
     assert page.text("align_status") == "Type the distance in metres."
     length = 2 * float(np.linalg.norm(FAR - NEAR))
     page.type("metres", f"{length:.4f}")
+    page.type("sigma", "-1")
+    assert page.text("align_status") == "The standard deviation is 0 metres or more."
     page.type("sigma", "0.01")
     words = page.command()
     assert words[:4] == ["factorsfm", "align", folder, "--origin"]
