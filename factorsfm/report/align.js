@@ -24,20 +24,6 @@ function pixelText({position, u, v}) {
   return `${nameOf(position)}:${pixel(u * width - 0.5)},${pixel(v * height - 0.5)}`;
 }
 
-const onWindows = /^\/[A-Za-z]:\//.test(location.pathname);
-
-// The folder in which the page lies.
-function resultFolder() {
-  if (location.protocol !== "file:") return "RESULT";
-  const folder = decodeURIComponent(location.pathname).replace(/\/[^/]*$/, "");
-  return onWindows ? folder.slice(1).replaceAll("/", "\\") : folder;
-}
-
-function quoted(word) {
-  if (/^[\w@%+=:,./-]+$/.test(word)) return word;
-  return onWindows ? `"${word}"` : `'${word.replaceAll("'", "'\\''")}'`;
-}
-
 // What is still missing for a command; empty if nothing is.
 function missing() {
   const {origin, axis, plane, from, to} = aligning.picks, scale = chosen("scale");
@@ -58,10 +44,10 @@ function command() {
   if (scale === "distance") words.push("--distance", pixelText(from), pixelText(to), byId("metres").value + (sigma > 0 ? `,${byId("sigma").value}` : ""));
   if (scale === "height") words.push("--camera-height", byId("height").value);
   if (data.footage) words.push("--footage", data.footage);
-  return words.map(String).map(quoted).join(" ");
+  return words.map(String).map(shellWord).join(" ");
 }
 
-function copyCommand() {
+function copyAlignment() {
   getSelection().selectAllChildren(byId("command"));
   say(document.execCommand("copy") ? "Copied." : "The command is selected: copy it.");
 }
@@ -267,7 +253,7 @@ function startAligning() {
   };
   document.querySelectorAll("[data-pick]").forEach(addPickControl);
   for (const input of document.querySelectorAll("#align_section input")) input.addEventListener("input", showAlignment);
-  byId("copy").addEventListener("click", copyCommand);
+  byId("copy").addEventListener("click", copyAlignment);
   footage.tabIndex = 0;
   footage.setAttribute("aria-label", `${footage.getAttribute("aria-label")}; arrow keys go through the frames, or move the cross of a pick`);
   footage.addEventListener("keydown", keyInPicture);

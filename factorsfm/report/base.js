@@ -42,6 +42,23 @@ function coalesced(draw) {
   };
 }
 
+// ---- commands that the page writes ------------------------------------------------------------------------
+
+const onWindows = /^\/[A-Za-z]:\//.test(location.pathname);
+
+// The folder in which the page lies.
+function resultFolder() {
+  if (location.protocol !== "file:") return "RESULT";
+  const folder = decodeURIComponent(location.pathname).replace(/\/[^/]*$/, "");
+  return onWindows ? folder.slice(1).replaceAll("/", "\\") : folder;
+}
+
+// A word of a command as the shell takes it.
+function shellWord(word) {
+  if (/^[\w@%+=:,./-]+$/.test(word)) return word;
+  return onWindows ? `"${word}"` : `'${word.replaceAll("'", "'\\''")}'`;
+}
+
 // ---- points, cameras and tracks -------------------------------------------------------------------------
 
 const points = typed(data.points, Float32Array), colors = typed(data.colors, Uint8Array);
