@@ -19,21 +19,24 @@ from factorsfm.result.moving import moving_json
 from factorsfm.result.objects import objects_json
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.result.summary import failure_summary, incomplete_summary, part_name, summary
+from factorsfm.result.tracks_file import write_tracks
 from factorsfm.support.errors import InputError
 from factorsfm.support.json_reading import read_json
 from factorsfm.support.json_text import json_text
 from factorsfm.support.program import PROGRAM
 
 # Whatever an earlier result may have left besides summary.json; picture.png is drawn by the demo.
-_ENTRIES = ("trajectory.tum", "colmap", "points.ply", "objects.json", "moving.json", "report.html", "picture.png")
+_ENTRIES = (
+    "trajectory.tum", "colmap", "points.ply", "objects.json", "moving.json", "tracks.npz", "report.html", "picture.png",
+)  # fmt: skip
 _SUMMARY = "summary.json"
 _PARTS = "part-[0-9][0-9][0-9]*"  # folders of the other parts of an image set
 _REPLACING = f".{PROGRAM}-replacing-"  # begins the name of the folder in which a result waits that replaces another
 
 
 def write_folder(reconstruction: Reconstruction, directory: str | Path) -> None:
-    """Write trajectory.tum, colmap/, points.ply, summary.json, report.html; objects.json where there are objects, and
-    moving.json where something moves by itself.
+    """Write trajectory.tum, colmap/, points.ply, summary.json, report.html; objects.json where there are objects,
+    moving.json where something moves by itself, and of a video tracks.npz.
 
     All of them or nothing.
 
@@ -61,6 +64,8 @@ def _write_files(reconstruction: Reconstruction, folder: Path) -> None:
     if reconstruction.moving is not None:
         content = json_text(moving_json(reconstruction.moving), indent=None)
         (folder / "moving.json").write_text(content, encoding="utf-8")
+    if reconstruction.measured is not None:
+        write_tracks(reconstruction.measured, folder / "tracks.npz")
     (folder / "report.html").write_text(report_html(reconstruction), encoding="utf-8")
     (folder / _SUMMARY).write_text(json_text(summary(reconstruction)), encoding="utf-8")
 

@@ -22,6 +22,7 @@ from factorsfm.result.moving import read_moving
 from factorsfm.result.objects import read_objects
 from factorsfm.result.reconstruction import FrameResult, LensFit, PriorFit, Reconstruction, RollingShutter
 from factorsfm.result.summary import part_name
+from factorsfm.result.tracks_file import read_tracks
 from factorsfm.support.errors import InputError
 from factorsfm.support.file_names import check_name
 from factorsfm.support.json_reading import read_json, typed
@@ -104,6 +105,7 @@ def read_result(directory: str | Path) -> Reconstruction:
         result = _reconstruction(summary, pycolmap.Reconstruction(directory / "colmap"))
         result.objects = read_objects(directory / "objects.json")
         result.moving = read_moving(directory / "moving.json")
+        result.measured = read_tracks(directory / "tracks.npz")
     except (InputError, OSError, ValueError, LookupError, RuntimeError) as error:
         raise InputError(f"the result in {directory} is damaged: {error}") from error
     result.others = [read_result(directory / part_name(number)) for number in range(2, summary.parts + 1)]

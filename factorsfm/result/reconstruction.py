@@ -16,6 +16,7 @@ from factorsfm.control.fit import ControlFit
 from factorsfm.inertial.fit import ImuFit
 from factorsfm.motion.stretches import Stretch
 from factorsfm.objects.object_result import ObjectResult
+from factorsfm.polish.measured import MeasuredShot
 from factorsfm.polish.observability import CameraObservability
 from factorsfm.result.alignment import Alignment
 from factorsfm.result.moving import Moving
@@ -198,6 +199,7 @@ class Reconstruction:
         seconds: wall time by stage.
         options: all options as plain data.
         others: reconstructions of other parts of an image set that cannot be joined to this one, largest first.
+        measured: of a video, what it was solved from, so that it can be solved again; None if it is not kept.
     """
 
     camera: pycolmap.Camera
@@ -229,6 +231,7 @@ class Reconstruction:
     seconds: dict[str, float] = field(default_factory=dict)
     options: dict[str, Any] = field(default_factory=dict)
     others: list[Reconstruction] = field(default_factory=list)
+    measured: MeasuredShot | None = None
 
     @property
     def registered(self) -> list[FrameResult]:

@@ -26,7 +26,9 @@ from factorsfm.priors.image_depth import ImageDepth
 from factorsfm.priors.masks import MaskPrior
 from factorsfm.priors.read_priors import read_depth, read_mask
 from factorsfm.report.thumbnails import Thumbnails
+from factorsfm.result.lost_frames import with_large_steps
 from factorsfm.result.reconstruction import Reconstruction
+from factorsfm.result.repeats import add_recorded, add_results
 from factorsfm.streaming.finishing import EndedShot
 from factorsfm.streaming.footage import Footage
 from factorsfm.streaming.frame_update import (
@@ -41,7 +43,6 @@ from factorsfm.streaming.frame_update import (
     pose_of,
 )
 from factorsfm.streaming.imu_source import ImuSource, restore_imu
-from factorsfm.streaming.lost_frames import with_large_steps
 from factorsfm.streaming.snapshot import read_snapshot, write_snapshot
 from factorsfm.streaming.suspicion import Suspicion
 from factorsfm.streaming.view_finder import ViewFinder
@@ -173,7 +174,7 @@ class Stream(Closing):
         if self._mapper is None:
             return []
         self._mapper.refresh()
-        return self._footage.with_repeats([pose_of(image) for image in self._mapper.images])
+        return self._footage.recorded.with_repeats([pose_of(image) for image in self._mapper.images])
 
     def graph(self) -> LiveGraph:
         """A copy of the live factor graph, and its values; both empty before the second keyframe.
@@ -234,7 +235,7 @@ class Stream(Closing):
     def all_tracks(self) -> list[ImageTracks]:
         """The tracks of every frame so far, whether the map holds them or not; a repeated frame has its twin's."""
         images = self._mapper.images if self._mapper is not None else []
-        return self._footage.with_repeats([image.tracks for image in images])
+        return self._footage.recorded.with_repeats([image.tracks for image in images])
 
     @property
     def track_ids(self) -> NDArray[np.int64]:
@@ -327,9 +328,9 @@ class Stream(Closing):
                 frames = frame_results(self.frames, images)
                 self._thumbnails.attach(frames)
                 reason = with_large_steps(str(error), frames, images)
-                raise ReconstructionError(reason, self._footage.add_results(frames)) from error
+                raise ReconstructionError(reason, add_results(frames, self._footage.recorded)) from error
             self._thumbnails.attach(result.frames)
-            self._footage.add_to(result)
+            add_recorded(result, self._footage.recorded)
             return result
 
     def _ended(self) -> EndedShot:
@@ -346,7 +347,8 @@ class Stream(Closing):
         return EndedShot(
             frames=self.frames, mapper=self._mapper, colors=self._colors.table, camera=self.camera,
             lens_given=self._lens_given, depth=self._depth, without_depth=self._without_depth, control=self.control,
-            imu=self._imu, footage=self._footage, options=self.options, seconds=self.seconds, suspects=suspects,
+            imu=self._imu, footage=self._footage.recorded, options=self.options, seconds=self.seconds,
+            suspects=suspects,
         )  # fmt: skip
 
     def close(self) -> None:

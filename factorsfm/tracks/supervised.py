@@ -1,0 +1,36 @@
+"""Tracks that the user vouches for: placed by hand, or made by another program."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class SupervisedTracks:
+    """Which tracks of some images are supervised.
+
+    Attributes:
+        ids: (n,) ascending.
+        names: (n,) of the user.
+        sigma: (n,) standard deviation of each coordinate of their places, pixels.
+    """
+
+    ids: Index
+    names: tuple[str, ...]
+    sigma: Array
+
+    @classmethod
+    def none(cls) -> SupervisedTracks:
+        """No track."""
+        return cls(np.zeros(0, np.int64), (), np.zeros(0))
+
+    def of(self, ids: Index) -> SupervisedTracks:
+        """Those among some tracks."""
+        kept = np.flatnonzero(np.isin(self.ids, ids))
+        return SupervisedTracks(self.ids[kept], tuple(self.names[k] for k in kept.tolist()), self.sigma[kept])
