@@ -25,6 +25,8 @@ from factorsfm.imagesets.add_images import add_images
 from factorsfm.inertial.fit import ImuFit
 from factorsfm.inertial.mounting import open_imu
 from factorsfm.inertial.recording import ImuNoise, ImuRecording
+from factorsfm.mending.changes import MaskRegion
+from factorsfm.mending.solve_again import solve_again
 from factorsfm.objects.object_result import ObjectFrame, ObjectResult
 from factorsfm.polish.observability import CameraObservability
 from factorsfm.priors.depth import DepthFolder, DepthModel, DepthPrior
@@ -79,6 +81,7 @@ __all__ = [
     "MaskFolder",
     "MaskModel",
     "MaskPrior",
+    "MaskRegion",
     "ModelError",
     "Moving",
     "MovingStretch",
@@ -114,5 +117,6 @@ __all__ = [
     "read_frames",
     "read_result",
     "reconstruct",
+    "solve_again",
     "track",
 ]

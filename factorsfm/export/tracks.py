@@ -64,7 +64,7 @@ class Track:
     """A track in the registered frames.
 
     Attributes:
-        name: "track_" and the row of its point, counted from 1 as in COLMAP's model.
+        name: see `Reconstruction.track_names`.
         numbers: (k,) of the frames in the timeline, ascending.
         xy, undistorted: (k, 2) pixels from the top left corner of the image, on the footage, and on footage without
             distortion through the same pinhole.
@@ -94,9 +94,10 @@ def tracks_of(shot: Shot) -> Iterator[Track]:
     if not len(rows):
         return
     points, starts = np.unique(result.observation_point[rows], return_index=True)
+    names = result.track_names()
     for point, mine in zip(points.tolist(), np.split(rows, starts[1:]), strict=True):
         numbers = number[result.observation_frame[mine]]
-        yield Track(f"track_{point + 1:05d}", numbers, xy[mine], flat[mine], result.observation_error[mine])
+        yield Track(names[point], numbers, xy[mine], flat[mine], result.observation_error[mine])
 
 
 def _undistorted(camera: pycolmap.Camera, xy: Array) -> Array:

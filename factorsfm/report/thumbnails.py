@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import base64
+import json
 import logging
+import re
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -24,6 +27,7 @@ logger = logging.getLogger(__name__)
 _WIDTH = 384
 _QUALITY = 60  # of JPEG
 _MOST = 240  # about 4 MB
+_DATA = re.compile(r'<script type="application/json" id="data">(.*?)</script>', re.DOTALL)  # of a report
 
 
 class Thumbnails(Closing):
@@ -105,6 +109,19 @@ def _done(jpeg: bytes) -> Future[bytes]:
     done: Future[bytes] = Future()
     done.set_result(jpeg)
     return done
+
+
+def take_from_report(result: Reconstruction, report: Path) -> None:
+    """Give a result that was read back the thumbnails of its report, as far as there are some."""
+    try:
+        data = _DATA.search(report.read_text(encoding="utf-8"))
+        content = json.loads(data[1]) if data is not None else {}
+        pictures = dict(zip(content["frame"], content["thumbnail"], strict=True))
+        for frame in result.frames:
+            kept = pictures.get(frame.index)
+            frame.thumbnail = base64.b64decode(kept, validate=True) if kept else None
+    except (OSError, ValueError, LookupError, TypeError) as error:  # a report without pictures is one, too
+        logger.info("no thumbnails: %s", error)
 
 
 def retake(result: Reconstruction, footage: Path | None = None) -> None:

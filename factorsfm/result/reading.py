@@ -90,9 +90,8 @@ def read_result(directory: str | Path) -> Reconstruction:
     """Read what `Reconstruction.write` has written.
 
     Poses, points, colours and the lens come back exactly, observations to a millionth of a pixel. What the files do
-    not hold is missing: covariances, the observations' noise, the tracks' identities (here: the points' rows), the
-    prior's residuals (NaN), observations in frames that are not registered, and points that fewer than two registered
-    frames see.
+    not hold is missing: covariances, the observations' noise, the prior's residuals (NaN), observations in frames that
+    are not registered, and points that fewer than two registered frames see.
 
     Raises:
         InputError: the folder holds no result, an incomplete or a damaged one, or that of a shot that could not be
@@ -150,7 +149,7 @@ def _reconstruction(summary: _Summary, model: pycolmap.Reconstruction) -> Recons
         frames=frames,
         points=xyz,
         colors=np.array([point.color for point in points], np.uint8).reshape(-1, 3),
-        track_ids=np.arange(len(points)),
+        track_ids=np.array([*row_of_point], np.int64) - 1,
         observation_frame=np.repeat(np.arange(len(frames)), [len(rows) for rows, _ in seen]),
         observation_point=np.concatenate([np.empty(0, np.int64), *(rows for rows, _ in seen)]),
         observation_xy=pixels - PIXEL_CENTER,

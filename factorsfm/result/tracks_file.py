@@ -115,7 +115,7 @@ def write_tracks(measured: MeasuredShot, path: Path) -> None:
         "frame_start": np.cumsum([0, *(len(image.ids) for image in tracks)]),
         "track": ids,
         "xy": np.concatenate([image.pixels for image in tracks]),
-        "inverse_depth": np.concatenate([_usable(depth, len(image.ids)) for depth, image in zip(depths, tracks, strict=True)]),
+        "inverse_depth": np.concatenate([_usable_depth(image) for image in tracks]),
         "depth_unit": np.array([np.nan if depth is None else depth.unit for depth in depths]),
         "cam_from_map": np.array([_matrix(image) for image in measured.images]),
         "point_track": measured.map_points[0],
@@ -129,9 +129,10 @@ def write_tracks(measured: MeasuredShot, path: Path) -> None:
         np.savez_compressed(file, facts=np.array(json_text(asdict(facts), indent=None)), **stored)  # type: ignore[arg-type]
 
 
-def _usable(depth: ImageDepth | None, count: int) -> NDArray[np.float64]:
+def _usable_depth(image: ImageTracks) -> NDArray[np.float64]:
     """(n,) inverse depths where the prior is used, NaN elsewhere."""
-    return np.full(count, np.nan) if depth is None else np.where(depth.valid, depth.inverse_depth, np.nan)
+    depth = image.depth
+    return np.full(len(image.ids), np.nan) if depth is None else np.where(depth.valid, depth.inverse_depth, np.nan)
 
 
 def _matrix(image: MappedImage) -> NDArray[np.float64]:

@@ -34,3 +34,12 @@ class SupervisedTracks:
         """Those among some tracks."""
         kept = np.flatnonzero(np.isin(self.ids, ids))
         return SupervisedTracks(self.ids[kept], tuple(self.names[k] for k in kept.tolist()), self.sigma[kept])
+
+    def without(self, ids: Index) -> SupervisedTracks:
+        """Those that are not among some tracks."""
+        return self.of(np.setdiff1d(self.ids, ids))
+
+
+def track_name(track: int) -> str:
+    """The name of a track, by its id, that has none of the user: with the number of its point in COLMAP's model."""
+    return f"track_{track + 1:05d}"
