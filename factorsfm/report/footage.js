@@ -84,6 +84,7 @@ function drawFootage() {
     context.lineTo(x(o) + pixel * tracks.residual[2 * o], y(o) + pixel * tracks.residual[2 * o + 1]);
     context.stroke();
   }
+  drawPointed(prepared, position);
 }
 
 // ---- depth -----------------------------------------------------------------------------------------------
