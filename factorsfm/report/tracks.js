@@ -32,6 +32,13 @@ function drawPointed({context, width, height, ratio}, position) {
   }
 }
 
+function drawPointedAlone() {
+  const prepared = prepare(byId("pointed"));
+  if (!prepared) return;
+  drawPicture(prepared, seek.position, 1);
+  drawPointed(prepared, seek.position);
+}
+
 function sortRows(key) {
   list.descending = key === list.key ? !list.descending : key !== "name" && key !== "first";
   list.key = key;
