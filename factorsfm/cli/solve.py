@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from factorsfm.cli.command import Command, add_output, add_range, range_of, write_result
+from factorsfm.cli.command import Command, add_output, add_range, add_tracks, range_of, tracks_of, write_result
 from factorsfm.cli.progress_line import ProgressLine
-from factorsfm.mending.solve_again import solve_again
+from factorsfm.mending.solve_again import read_with_pictures, solve_again
 from factorsfm.report.result_folder import check_directory
 from factorsfm.support.errors import InputError
 
@@ -37,6 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE.json",
         help="known poses, points, distances and heights (default: those of the result)",
     )
+    add_tracks(parser)
 
 
 def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
@@ -44,12 +45,14 @@ def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
     check_directory(arguments.output)
     if arguments.output.resolve() == arguments.result.resolve():
         raise InputError("the output folder is that of the result, which keeps what is left out; choose another one")
+    known = read_with_pictures(arguments.result)
     solved = solve_again(
-        arguments.result,
+        known,
         without_tracks=arguments.without_tracks,
         mask_regions=arguments.mask_region,
         frames=range_of(arguments),
         control=arguments.control,
+        tracks=tracks_of(arguments, known.options.get("first_number")),
         progress=progress,
     )
     return write_result(solved, arguments.output, progress)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from factorsfm.export.moving import MovingNull, moving_nulls
 from factorsfm.export.options import ExportOptions, UpAxis
-from factorsfm.export.other_footage import Numbering, at_size_of, match_numbers
+from factorsfm.export.other_footage import Numbering, at_size_of, match_numbers, of_source
 from factorsfm.frames.fields import Fields
 from factorsfm.result.image_sources import fields_of
 from factorsfm.result.other_world import in_other_world
@@ -271,6 +271,15 @@ def _first_frame(options: ExportOptions, defaults: Defaults, numbering: Numberin
     if defaults.numbered and numbering.timeline is not None:
         return numbering.timeline
     return defaults.first_frame + numbering.shift - numbering.footage_first
+
+
+def first_frame_of(first_number: int | None, first_frame: int | None, defaults: Defaults) -> int:
+    """What an export adds to the index of a frame in its source.
+
+    Args:
+        first_number: of a source that is a numbered sequence; first_frame: see `ExportOptions`.
+    """
+    return _first_frame(ExportOptions(first_frame=first_frame), defaults, of_source(first_number))
 
 
 def _source_fps(frames: list[FrameResult]) -> float | None:

@@ -8,7 +8,9 @@ from pathlib import Path
 
 from factorsfm.control.known import Control
 from factorsfm.mending.changes import Changes, MaskRegion
+from factorsfm.mending.joined import joined
 from factorsfm.mending.same_world import in_world_of
+from factorsfm.mending.user_tracks import UserTracks, read_tracks
 from factorsfm.report.thumbnails import take_from_report
 from factorsfm.result.left_out import add_left_out
 from factorsfm.result.reading import read_result
@@ -28,6 +30,7 @@ def solve_again(
     mask_regions: Sequence[MaskRegion | str] = (),
     frames: slice | None = None,
     control: str | Path | Control | None = None,
+    tracks: str | Path | UserTracks | None = None,
     progress: Progress | None = None,
 ) -> Reconstruction:
     """The final solve of a shot once more, from what was measured for a result, with changes.
@@ -41,6 +44,7 @@ def solve_again(
         mask_regions: in which nothing counts, or their texts, see `MaskRegion.parse`.
         frames: the others are left out; numbers as in the result.
         control: what is known beforehand, or its JSON file; None is that of the result, if it had some.
+        tracks: of the user, that take part from now on, or their file (`read_tracks`).
         progress: called with the stage.
 
     Raises:
@@ -48,11 +52,7 @@ def solve_again(
         ReconstructionError: the shot cannot be solved with these changes.
     """
     begin = time.perf_counter()
-    if isinstance(result, Reconstruction):
-        known = result
-    else:
-        known = read_result(result)
-        take_from_report(known, Path(result) / "report.html")
+    known = result if isinstance(result, Reconstruction) else read_with_pictures(result)
     if known.measured is None:
         raise InputError(
             "the result keeps no tracks to solve again: it is of images in any order, or of an earlier version; "
@@ -60,6 +60,13 @@ def solve_again(
         )
     changes = Changes.of(without_tracks, mask_regions, frames, control)
     measured = changes.applied(known.measured)
+    if tracks is not None:
+        given = (
+            tracks
+            if isinstance(tracks, UserTracks)
+            else read_tracks(tracks, first_number=known.options.get("first_number"))
+        )
+        measured = joined(measured, given, {frame.index: known.camera_of(frame) for frame in known.frames})
     with OneThreadEach():
         polished = measured.solved(lambda stage: progress(stage, 0, None) if progress else None)
         solved = solved_shot(measured, polished, {"polish": time.perf_counter() - begin})
@@ -71,6 +78,13 @@ def solve_again(
     solved.options = {**known.options, "solved_again": history}
     solved.seconds["total"] = time.perf_counter() - begin
     return solved
+
+
+def read_with_pictures(directory: str | Path) -> Reconstruction:
+    """A result, read back, with the pictures of its report; errors as in `read_result`."""
+    result = read_result(directory)
+    take_from_report(result, Path(directory) / "report.html")
+    return result
 
 
 def _take_over_frames(solved: Reconstruction, known: Reconstruction, changes: Changes) -> None:

@@ -93,6 +93,7 @@ class MeasuredShot:
             first_focal=(np.array([focal]), std),
             recording=self._recording(),
             suspects=self.suspects,
+            supervised=self.supervised,
             in_time=True,
         )
 

@@ -41,7 +41,7 @@ def listed_tracks(reconstruction: Reconstruction) -> ListedTracks:
     """The tracks to list, of those that registered frames see."""
     r = reconstruction
     registered = np.array([frame.registered for frame in r.frames], bool)
-    finite = np.isfinite(r.points).all(axis=1)[r.observation_point] & np.isfinite(r.observation_error)
+    finite = np.asarray(np.isfinite(r.points).all(axis=1))[r.observation_point] & np.isfinite(r.observation_error)
     seen = np.flatnonzero(registered[r.observation_frame] & finite)
     seen = seen[np.lexsort((r.observation_frame[seen], r.observation_point[seen]))]
     frame, error = r.observation_frame[seen], r.observation_error[seen]

@@ -16,6 +16,8 @@ from factorsfm.frames.recorded import RecordedFootage, RecordedFrame
 from factorsfm.graph.added_factors import AddedFactors
 from factorsfm.graph.factors_on_poses import FactorsOnPoses
 from factorsfm.mapping.mapper import Mapper
+from factorsfm.mending.joined import joined
+from factorsfm.mending.user_tracks import UserTracks
 from factorsfm.polish.measured import MeasuredShot
 from factorsfm.polish.polished import Polished
 from factorsfm.priors.depth import DepthPrior
@@ -44,6 +46,7 @@ class EndedShot:
         control: what is known beforehand; imu: beside the stream; footage: how the frames were recorded.
         seconds: of the stages so far; that of the polish is added.
         suspects: ids of the tracks that count only where they agree with the others.
+        tracks: of the user.
     """
 
     frames: Sequence[SeenFrame]
@@ -59,6 +62,7 @@ class EndedShot:
     options: Options
     seconds: StageSeconds
     suspects: NDArray[np.int64]
+    tracks: UserTracks | None
 
     def reconstruction(self, progress: Progress | None) -> Reconstruction:
         """Polish over all frames and tracks; errors as in `Stream.finish`."""
@@ -85,7 +89,7 @@ class EndedShot:
             notes.append(f"Frames that went without depth because the prior failed: {count}; {first}.")
         if self.mapper.without_prior:
             notes.append(f"The map went on without the depth prior: {self.mapper.without_prior}.")
-        return MeasuredShot(
+        measured = MeasuredShot(
             frames=[RecordedFrame(frame.index, frame.name, frame.timestamp) for frame in self.frames],
             footage=self.footage,
             images=self.mapper.images,
@@ -101,6 +105,7 @@ class EndedShot:
             control=self.control,
             notes=tuple(notes),
         )
+        return measured if self.tracks is None else joined(measured, self.tracks)
 
     def _factors(self) -> ShotFactors | None:
         """Those that were added to the live graph, with the poses that these are beside."""

@@ -21,6 +21,7 @@ from factorsfm.graph.process import GraphProcess
 from factorsfm.inertial.recording import ImuRecording
 from factorsfm.lens.camera_model import distortion_of
 from factorsfm.mapping.mapper import Mapper
+from factorsfm.mending.user_tracks import UserTracks
 from factorsfm.priors.depth import DepthPrior
 from factorsfm.priors.image_depth import ImageDepth
 from factorsfm.priors.masks import MaskPrior
@@ -270,13 +271,9 @@ class Stream(Closing):
 
     @classmethod
     def load(
-        cls,
-        path: str | Path,
-        *,
-        depth: DepthPrior | None = None,
-        masks: MaskPrior | None = None,
-        imu: ImuRecording | None = None,
-    ) -> Stream:
+        cls, path: str | Path, *,
+        depth: DepthPrior | None = None, masks: MaskPrior | None = None, imu: ImuRecording | None = None,
+    ) -> Stream:  # fmt: skip
         """Go on where a stream was saved; the next frame to push is number `len(stream.frames)`.
 
         Args:
@@ -313,16 +310,16 @@ class Stream(Closing):
         self._suspicion.restore(state["suspicion"])
         restore_imu(self._imu, state["imu"])
 
-    def finish(self, progress: Progress | None = None) -> Reconstruction:
-        """Polish over all frames and tracks.
+    def finish(self, progress: Progress | None = None, *, tracks: UserTracks | None = None) -> Reconstruction:
+        """Polish over all frames and tracks, those of the user too.
 
         Raises:
-            InputError: the control names a frame that is not there.
+            InputError: control or tracks of the user cannot be used with these frames.
             ReconstructionError: no frame could be registered, or too few points remain.
         """
         with self:
             try:
-                result = self._ended().reconstruction(progress)
+                result = self._ended(tracks).reconstruction(progress)
             except ReconstructionError as error:
                 images = self._mapper.images if self._mapper is not None else []
                 frames = frame_results(self.frames, images)
@@ -333,7 +330,7 @@ class Stream(Closing):
             add_recorded(result, self._footage.recorded)
             return result
 
-    def _ended(self) -> EndedShot:
+    def _ended(self, tracks: UserTracks | None) -> EndedShot:
         """The shot, now that no more frames come."""
         if self._mapper is None or len(self.frames) < 2:
             raise ReconstructionError(f"frames in the shot: {len(self.frames)}, at least 2 needed")
@@ -348,7 +345,7 @@ class Stream(Closing):
             frames=self.frames, mapper=self._mapper, colors=self._colors.table, camera=self.camera,
             lens_given=self._lens_given, depth=self._depth, without_depth=self._without_depth, control=self.control,
             imu=self._imu, footage=self._footage.recorded, options=self.options, seconds=self.seconds,
-            suspects=suspects,
+            suspects=suspects, tracks=tracks,
         )  # fmt: skip
 
     def close(self) -> None:

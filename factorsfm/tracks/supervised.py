@@ -30,6 +30,13 @@ class SupervisedTracks:
         """No track."""
         return cls(np.zeros(0, np.int64), (), np.zeros(0))
 
+    def sigma_of(self, tracks: Index) -> Array:
+        """(m,) standard deviations of some tracks, pixels; NaN of those that are not supervised."""
+        found = np.full(len(tracks), np.nan)
+        mine = np.isin(tracks, self.ids)
+        found[mine] = self.sigma[np.searchsorted(self.ids, tracks[mine])]
+        return found
+
     def of(self, ids: Index) -> SupervisedTracks:
         """Those among some tracks."""
         kept = np.flatnonzero(np.isin(self.ids, ids))
