@@ -134,12 +134,13 @@ class Changes:
             "control": self.control_from or ("given" if self.control is not None else None),
         }
 
-    def notes(self) -> list[str]:
-        """What was left out, in sentences."""
+    def notes(self, measured: MeasuredShot) -> list[str]:
+        """What of a shot was left out, in sentences."""
         notes = []
         if self.tracks:
-            named = ", ".join(self.tracks[:_MOST_NAMED]) + (", …" if len(self.tracks) > _MOST_NAMED else "")
-            notes.append(f"Solved again without {len(self.tracks)} tracks: {named}.")
+            names = measured.supervised.names_of(_ids_of(measured, self.tracks))
+            named = ", ".join(names[:_MOST_NAMED]) + (", …" if len(names) > _MOST_NAMED else "")
+            notes.append(f"Solved again without {len(names)} tracks: {named}.")
         if self.regions:
             notes.append(f"Solved again without what is seen in {' and '.join(map(str, self.regions))}.")
         return notes

@@ -47,7 +47,7 @@ def joined(measured: MeasuredShot, given: UserTracks, lenses: dict[int, pycolmap
     images = list(measured.images)
     for k, places in seen.items():
         camera = measured.camera if lenses is None else lenses.get(measured.frames[k].index, measured.camera)
-        xy = _on_footage(np.array([place for _, place in places]), given, camera)
+        xy = on_footage(np.array([place for _, place in places]), given, camera)
         if not np.isfinite(xy).all():
             row = int(np.argmin(np.isfinite(xy).all(axis=1)))
             name = kept[places[row][0] - first].name
@@ -64,7 +64,7 @@ def joined(measured: MeasuredShot, given: UserTracks, lenses: dict[int, pycolmap
     return replace(measured, images=images, supervised=supervised, colors=colors)
 
 
-def _on_footage(xy: Array, given: UserTracks, camera: pycolmap.Camera) -> Array:
+def on_footage(xy: Array, given: UserTracks, camera: pycolmap.Camera) -> Array:
     """(n, 2) places of the tracks on the footage, pixels with centres at integers."""
     if given.from_bottom:
         xy = np.column_stack([xy[:, 0], camera.height - PIXEL_CENTER - xy[:, 1]])

@@ -73,7 +73,7 @@ def solve_again(
     add_recorded(solved, measured.footage)
     _take_over_frames(solved, known, changes)
     solved = in_world_of(known, solved)
-    solved.notes += [*_not_again(known), *changes.notes()]
+    solved.notes += [*_not_again(known), *changes.notes(known.measured)]
     history = [*known.options.get("solved_again", []), changes.said()]
     solved.options = {**known.options, "solved_again": history}
     solved.seconds["total"] = time.perf_counter() - begin

@@ -124,22 +124,21 @@ def read_tracks(
     except ValueError as error:
         raise InputError(f"tracks {path} are no text") from error
     format, read = _format_of(text, path)
+    shift = first_frame_of(first_number, first_frame, FORMATS[format].defaults)
+    corner = np.array([0.5, 0.5 if format == "tracks-csv" else 0.0])  # y from the bottom stays as it is
     try:
-        curves = read(text)
-        shift = first_frame_of(first_number, first_frame, FORMATS[format].defaults)
-        corner = np.array([0.5, 0.5 if format == "tracks-csv" else 0.0])  # y from the bottom stays as it is
         tracks = [
             UserTrack(
                 name.strip(),
                 np.array(sorted(places), np.int64) - shift,
                 np.array([places[number] for number in sorted(places)]) - corner,
             )
-            for name, places in curves.items()
+            for name, places in read(text).items()
         ]
-        plate: Plate = on or ("undistorted" if format == "tracks-nuke" else "footage")
-        return UserTracks(tracks, sigma, plate, format != "tracks-csv", str(path))
-    except (ValueError, LookupError, OverflowError) as error:
+    except (ValueError, LookupError, OverflowError, RecursionError, InputError) as error:
         raise InputError(f"tracks {path}: {error}") from error
+    plate: Plate = on or ("undistorted" if format == "tracks-nuke" else "footage")
+    return UserTracks(tracks, sigma, plate, format != "tracks-csv", f"tracks {path}")
 
 
 def _format_of(text: str, path: Path) -> tuple[str, Callable[[str], _Curves]]:

@@ -21,7 +21,7 @@ from factorsfm.polish.observability import CameraObservability
 from factorsfm.result.alignment import Alignment
 from factorsfm.result.moving import Moving
 from factorsfm.support.status import FrameStatus, ShotKind
-from factorsfm.tracks.supervised import SupervisedTracks, track_name
+from factorsfm.tracks.supervised import SupervisedTracks
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,8 +242,7 @@ class Reconstruction:
     def track_names(self) -> list[str]:
         """(n,) of the track of each point: that of the user, or "track_" and its number in COLMAP's model."""
         named = self.measured.supervised if self.measured is not None else SupervisedTracks.none()
-        given = dict(zip(named.ids.tolist(), named.names, strict=True))
-        return [given.get(track) or track_name(track) for track in self.track_ids.tolist()]
+        return named.names_of(self.track_ids)
 
     def camera_of(self, frame: FrameResult) -> pycolmap.Camera:
         """The lens of a frame."""

@@ -42,6 +42,11 @@ class SupervisedTracks:
         kept = np.flatnonzero(np.isin(self.ids, ids))
         return SupervisedTracks(self.ids[kept], tuple(self.names[k] for k in kept.tolist()), self.sigma[kept])
 
+    def names_of(self, tracks: Index) -> list[str]:
+        """(m,) names of some tracks: those of the user, else `track_name`."""
+        given = dict(zip(self.ids.tolist(), self.names, strict=True))
+        return [given.get(track) or track_name(track) for track in tracks.tolist()]
+
     def without(self, ids: Index) -> SupervisedTracks:
         """Those that are not among some tracks."""
         return self.of(np.setdiff1d(self.ids, ids))
