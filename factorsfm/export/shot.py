@@ -16,13 +16,14 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.export.moving import MovingNull, moving_nulls
+from factorsfm.export.nulls import Null, moving_nulls, point_nulls
 from factorsfm.export.options import ExportOptions, UpAxis
 from factorsfm.export.other_footage import Numbering, at_size_of, match_numbers, of_source
 from factorsfm.frames.fields import Fields
 from factorsfm.result.image_sources import fields_of
 from factorsfm.result.other_world import in_other_world
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
+from factorsfm.result.supervised import named_points
 from factorsfm.support.similarity import Similarity
 
 _TURNED_WORLD = {  # exported world from the reconstruction's
@@ -174,9 +175,10 @@ class Shot:
         return np.asarray(self.world_from_opencv @ _FILM_CAMERA, dtype=np.float64)
 
     @cached_property
-    def objects(self) -> list[MovingNull]:
-        """What moves by itself."""
-        return moving_nulls(self.reconstruction.objects, self.first_frame)
+    def nulls(self) -> list[Null]:
+        """What moves by itself, and the named points."""
+        objects = moving_nulls(self.reconstruction.objects, self.first_frame)
+        return objects + point_nulls(named_points(self.reconstruction), self.numbers[0])
 
     @cached_property
     def lens(self) -> Lens:

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -30,6 +31,7 @@ from factorsfm.export import export
 from factorsfm.mending.joined import on_footage
 from tests.command_line import assert_error
 from tests.exact_result import build
+from tests.exported_files import after_effects_tracks, nuke_curves, nuke_nodes
 from tests.rendered import FRAMES, rendered, with_fewer_tracks
 from tests.report.chromium import EXECUTABLE, MISSING, Chromium
 
@@ -217,6 +219,30 @@ def test_supervised_tracks_become_named_points(result: Reconstruction, solved: P
     )
     for frame, other in zip(found.frames, result.frames, strict=True):
         np.testing.assert_allclose(frame.cam_from_world.matrix(), other.cam_from_world.matrix(), atol=2e-3)
+
+
+def test_named_points_are_nulls(solved: Path, tmp_path: Path) -> None:
+    found, points = read_result(solved), json.loads((solved / "summary.json").read_text())["named_points"]
+    x, y, z = next(point["position"] for point in points if point["name"] == "window 2")
+    names = {"nuke": "nuke", "blender": "scene.py", "usd": "a.usda", "after-effects": "ae", "alembic": "a.abc"}
+    for format, name in names.items():
+        export(found, tmp_path / name, format=format, options=ExportOptions(scale=2.0))
+    script = (tmp_path / "nuke" / "camera.nk").read_text()
+    assert "AllPoints" not in script
+    moved = nuke_curves(nuke_nodes(script)["point_window_2"]["translate"])
+    np.testing.assert_allclose(moved[1001], [2 * x, -2 * y, -2 * z], rtol=1e-9)
+    assert not (tmp_path / "nuke" / "point_window_2.obj").exists()
+    nulls = json.loads(eval(re.findall(r"json.loads\((.*)\)\n", (tmp_path / "scene.py").read_text())[0]))["objects"]
+    (null,) = (null for null in nulls if null["name"] == "point_window_2")
+    np.testing.assert_allclose(null["locations"], [[2 * x, 2 * z, -2 * y]], rtol=1e-9)
+    _, keys = after_effects_tracks((tmp_path / "ae" / "point_window_2.txt").read_text())
+    np.testing.assert_allclose(keys["Transform\tPosition"][0], [2 * x + 160, 2 * y + 90, 2 * z], rtol=1e-9)
+    usd = pytest.importorskip("pxr.Usd")
+    stage = usd.Stage.Open(str(tmp_path / "a.usda"))
+    prim = stage.GetPrimAtPath("/factorsfm/point_window_2")
+    translation = prim.GetAttribute("xformOp:transform").Get(1001).ExtractTranslation()
+    np.testing.assert_allclose(translation, [2 * x, -2 * y, -2 * z], rtol=1e-9)
+    assert not prim.GetChildren()
 
 
 def test_they_are_left_out_by_their_names_and_numbers(solved: Path, tmp_path: Path) -> None:
