@@ -34,13 +34,14 @@ DESCRIBED = {
     "stream": ["command-line.md", "streaming.md"],
     "batch": ["command-line.md", "films.md"],
     "extend": ["image-sets.md"],
+    "solve": ["mending.md"],
     "align": ["align.md"],
     "export": ["export.md"],
     "overlay": ["export.md"],
 }
 LARGEST_README = 12 * 1024
 FRAMES = 10
-FILES = {"trajectory.tum", "colmap", "points.ply", "summary.json", "report.html"}
+FILES = {"trajectory.tum", "colmap", "points.ply", "summary.json", "tracks.npz", "report.html"}
 OPTION = r"(?<![\w-])--[a-z][a-z-]+"
 
 
@@ -142,7 +143,7 @@ def test_command(block: Block, place: Path, monkeypatch: pytest.MonkeyPatch) -> 
             assert bool({"--control", "--imu"} & set(words)) == (summary["control"] is not None)
             assert not any(item["contradicts"] for item in (summary["control"] or {"residuals": []})["residuals"])
         elif words[1] == "extend":
-            assert {path.name for path in output.iterdir()} == FILES
+            assert {path.name for path in output.iterdir()} == FILES - {"tracks.npz"}
             summary = json.loads((output / "summary.json").read_text())
             assert summary["registered"] == summary["frames"] == FRAMES + 2
         elif words[1] == "batch":
@@ -251,7 +252,7 @@ def test_no_page_names_an_option_that_is_not_there(capsys: pytest.CaptureFixture
 def test_every_command_value_and_status_is_described() -> None:
     page = text_of(DOCS / "command-line.md")
     assert [row["command"].strip("`") for row in table(page, "command")] == [
-        "reconstruct", "stream", "batch", "extend", "align", "export", "overlay", "demo",
+        "reconstruct", "stream", "batch", "extend", "solve", "align", "export", "overlay", "demo",
     ]  # fmt: skip
     assert set(DESCRIBED) == {row["command"].strip("`") for row in table(page, "command")}
     for column, values in (("kind", ShotKind), ("status", FrameStatus), ("preset", PRESETS)):
