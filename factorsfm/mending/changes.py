@@ -140,7 +140,8 @@ class Changes:
         if self.tracks:
             names = measured.supervised.names_of(_ids_of(measured, self.tracks))
             named = ", ".join(names[:_MOST_NAMED]) + (", …" if len(names) > _MOST_NAMED else "")
-            notes.append(f"Solved again without {len(names)} tracks: {named}.")
+            count = f"{len(names)} track{'s' * (len(names) != 1)}"
+            notes.append(f"Solved again without {count}: {named}.")
         if self.regions:
             notes.append(f"Solved again without what is seen in {' and '.join(map(str, self.regions))}.")
         return notes

@@ -27,8 +27,11 @@ def joined(measured: MeasuredShot, given: UserTracks, lenses: dict[int, pycolmap
         lenses: of the frames by their numbers, for tracks that lie on undistorted footage; None: that of all frames.
 
     Raises:
-        InputError: no track has two frames of the shot, or a lens has no place for one.
+        InputError: no track has two frames of the shot, a lens has no place for one, or they lie on undistorted footage
+            and no lens is known.
     """
+    if given.on == "undistorted" and lenses is None and not measured.lens_given:
+        raise InputError(f"{given.source}: tracks on undistorted footage need its lens; a camera is expected")
     position = {frame.index: k for k, frame in enumerate(measured.frames)}
     kept = [t for t in given.tracks if sum(frame in position for frame in t.frames.tolist()) > 1]
     if not kept:

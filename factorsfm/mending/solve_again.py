@@ -60,13 +60,10 @@ def solve_again(
         )
     changes = Changes.of(without_tracks, mask_regions, frames, control)
     measured = changes.applied(known.measured)
+    if isinstance(tracks, str | Path):
+        tracks = read_tracks(tracks, first_number=known.options.get("first_number"))
     if tracks is not None:
-        given = (
-            tracks
-            if isinstance(tracks, UserTracks)
-            else read_tracks(tracks, first_number=known.options.get("first_number"))
-        )
-        measured = joined(measured, given, {frame.index: known.camera_of(frame) for frame in known.frames})
+        measured = joined(measured, tracks, {frame.index: known.camera_of(frame) for frame in known.frames})
     with OneThreadEach():
         polished = measured.solved(lambda stage: progress(stage, 0, None) if progress else None)
         solved = solved_shot(measured, polished, {"polish": time.perf_counter() - begin})
@@ -74,8 +71,8 @@ def solve_again(
     _take_over_frames(solved, known, changes)
     solved = in_world_of(known, solved)
     solved.notes += [*_not_again(known), *changes.notes(known.measured)]
-    history = [*known.options.get("solved_again", []), changes.said()]
-    solved.options = {**known.options, "solved_again": history}
+    said = {**changes.said(), "tracks": None if tracks is None else tracks.source}
+    solved.options = {**known.options, "solved_again": [*known.options.get("solved_again", []), said]}
     solved.seconds["total"] = time.perf_counter() - begin
     return solved
 

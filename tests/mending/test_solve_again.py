@@ -209,7 +209,7 @@ def test_the_command(result: Reconstruction, folder: Path, tmp_path: Path, capsy
     track = str(result.track_ids[5] + 1)
     command = ["solve", str(folder), "--without-tracks", track, "--mask-region", "0:2:0,0,40,40", "--frames", "0:8"]
     assert main([*command, "--output", str(tmp_path / "mended")]) == 0
-    assert f"Solved again without 1 tracks: track_{int(track):05d}." in capsys.readouterr().out
+    assert f"Solved again without 1 track: track_{int(track):05d}." in capsys.readouterr().out
     mended = factorsfm.read_result(tmp_path / "mended")
     assert len(mended.frames) == FRAMES
     assert mended.measured is not None
