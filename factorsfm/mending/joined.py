@@ -21,7 +21,8 @@ _GREY = 128  # of a point whose colour nobody has looked up
 
 
 def joined(measured: MeasuredShot, given: UserTracks, lenses: dict[int, pycolmap.Camera] | None = None) -> MeasuredShot:
-    """The shot with tracks of the user, which are supervised; of frames that it does not have nothing is taken.
+    """The shot with tracks of the user, which are supervised; of frames that it does not have nothing is taken, and
+    a note counts the tracks that have no other.
 
     Args:
         lenses: of the frames by their numbers, for tracks that lie on undistorted footage; None: that of all frames.
@@ -33,8 +34,9 @@ def joined(measured: MeasuredShot, given: UserTracks, lenses: dict[int, pycolmap
     if given.on == "undistorted" and lenses is None and not measured.lens_given:
         raise InputError(f"{given.source}: tracks on undistorted footage need its lens; a camera is expected")
     position = {frame.index: k for k, frame in enumerate(measured.frames)}
-    kept = [t for t in given.tracks if sum(frame in position for frame in t.frames.tolist()) > 1]
-    if not kept:
+    shared = [sum(frame in position for frame in track.frames.tolist()) for track in given.tracks]
+    kept = [track for track, count in zip(given.tracks, shared, strict=True) if count]
+    if max(shared) < 2:
         frames = np.concatenate([track.frames for track in given.tracks])
         raise InputError(
             f"{given.source}: no track has two frames of the shot; its frames are {min(position)} to {max(position)}, "
@@ -64,7 +66,10 @@ def joined(measured: MeasuredShot, given: UserTracks, lenses: dict[int, pycolmap
         (*known.names, *_new_names([track.name for track in kept], known.names, first)),
         np.r_[known.sigma, np.full(len(kept), given.sigma)],
     )
-    return replace(measured, images=images, supervised=supervised, colors=colors)
+    notes = measured.notes
+    if away := len(given.tracks) - len(kept):
+        notes = (*notes, f"Of {given.source}, {away} of {len(given.tracks)} have no frame of the shot.")
+    return replace(measured, images=images, supervised=supervised, colors=colors, notes=notes)
 
 
 def on_footage(xy: Array, given: UserTracks, camera: pycolmap.Camera) -> Array:

@@ -62,7 +62,7 @@ def supervised_notes(result: Reconstruction) -> list[str]:
             f"{_some(named)}."
         )
     if lost := [point.name for point in points if point.position is None]:
-        notes.append(f"Supervised tracks without a point, as fewer than two solved frames place it: {_some(lost)}.")
+        notes.append(f"Supervised tracks without a point, since the solved frames do not place it: {_some(lost)}.")
     return notes
 
 

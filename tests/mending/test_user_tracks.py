@@ -272,14 +272,19 @@ def test_the_report_finds_the_wrong_ones_and_its_command_leaves_them_out(solved:
 
 def test_a_track_that_cannot_be_placed_is_named(result: Reconstruction, tracks: UserTracks) -> None:
     first, second = tracks.tracks[:2]
-    outside = UserTrack("window 9", np.array([0, 90, 91]), np.array([[5.0, 5.0]] * 3))
+    once = UserTrack("window 9", np.array([0, 90, 91]), np.array([[5.0, 5.0]] * 3))
+    never = UserTrack("window 10", np.array([90, 91]), np.array([[5.0, 5.0]] * 2))
     again = UserTrack("track_00001", second.frames, second.xy)
-    found = solve_again(result, tracks=UserTracks([first, outside, again]))
-    names = found.track_names()
-    assert "window 9" not in names  # of one frame of the shot
-    assert "track_00001_2" in names
+    found = solve_again(result, tracks=UserTracks([first, once, never, again]))
+    assert [name for name in found.track_names() if name in ("window 0", "track_00001_2", "window 9")] == [
+        "window 0", "track_00001_2",
+    ]  # fmt: skip
+    assert found.notes[-2:] == [
+        "Supervised tracks without a point, since the solved frames do not place it: window 9.",
+        "Of the tracks, 1 of 4 have no frame of the shot.",
+    ]
     with pytest.raises(InputError, match="no track has two frames of the shot; its frames are 0 to 7"):
-        solve_again(result, tracks=UserTracks([outside]))
+        solve_again(result, tracks=UserTracks([once, never]))
 
 
 def test_reconstruct_takes_them(tracks: UserTracks, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
