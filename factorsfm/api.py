@@ -180,7 +180,15 @@ def _solve(
                 ObservedObjects(given.objects, given.masks, remembered, options.tracker)
             )
         stream = held.enter_context(
-            Stream(given.camera, depth=depth, masks=seen, options=options, control=given.control, imu=given.imu)
+            Stream(
+                given.camera,
+                depth=depth,
+                masks=seen,
+                options=options,
+                control=given.control,
+                imu=given.imu,
+                horizon=None,
+            )
         )
         beside = _pushed(stream, observed, images, left_out, progress)
         if not stream.frames:

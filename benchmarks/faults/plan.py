@@ -18,7 +18,9 @@ from benchmarks.plan import FULL, STUDIO
 from benchmarks.run import HERE
 from factorsfm import DepthKind, DepthMap, Frame
 from factorsfm.support.similarity import pose_arrays
-from factorsfm.synthetic import render_shot, simulate_prior
+from factorsfm.synthetic import RenderedShot, simulate_prior
+from factorsfm.synthetic.room import Room
+from factorsfm.synthetic.scene import camera_path, room_camera
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -130,7 +132,7 @@ def random_plan(seed: int, data: Path | None) -> Plan:
     faults = [Fault(name) for name in generator.choice([*Fault], generator.integers(1, 4), replace=False)]
     shots = [_shot_from_data(data, generator) if data else _rendered_shot(generator)]
     if {Fault.FOREIGN, Fault.CUT} & set(faults):
-        shots.append(_rendered_shot(generator, shots[0].images[0].shape, frames=_OTHER_SHOT_FRAMES))
+        shots.append(_rendered_shot(generator, shots[0].camera, frames=_OTHER_SHOT_FRAMES))
     plan = Plan(faults, shots, [PlannedFrame(image, (0, k)) for k, image in enumerate(shots[0].images)])
     for fault in faults:
         plan.frames = disturbed(fault, plan.frames, shots, generator)
@@ -191,14 +193,20 @@ def _damaged(image: Image, generator: Generator) -> Image:
     return damaged
 
 
-def _rendered_shot(
-    generator: Generator, shape: tuple[int, ...] = (_HEIGHT, _WIDTH), frames: int = _FRAMES
-) -> KnownShot:
+def _rendered_shot(generator: Generator, camera: pycolmap.Camera | None = None, frames: int = _FRAMES) -> KnownShot:
+    """A shot with a given lens, which is that of the whole film: rendered small, and enlarged."""
     motion = generator.choice(["dolly", "truck", "handheld", "arc"])
     parallax, seed = generator.uniform(0.04, 0.15), int(generator.integers(1000))
-    shot = render_shot(motion, frames, _WIDTH, _HEIGHT, parallax, seed)
-    images = [cv2.resize(image, shape[1::-1]) for image in shot.images]
-    return KnownShot(images, simulate_prior(shot, seed=seed), shot.camera, *pose_arrays(shot.cam_from_world))
+    lens = pycolmap.Camera((camera or room_camera(_WIDTH, _HEIGHT)).todict())
+    size = lens.width, lens.height
+    lens.rescale(_WIDTH, _HEIGHT)
+    room = Room(seed, lens.focal_length_x)
+    path = camera_path(motion, frames, parallax, float(np.median(room.depth(lens, pycolmap.Rigid3d()))), seed)
+    depths = [room.depth(lens, pose).astype(np.float32) for pose in path]
+    images = [room.image(lens, pose) for pose in path]
+    prior = simulate_prior(RenderedShot(images, depths, lens, path, np.ones(frames)), seed=seed)
+    lens.rescale(*size)
+    return KnownShot([cv2.resize(image, size) for image in images], prior, lens, *pose_arrays(path))
 
 
 def _shot_from_data(data: Path, generator: Generator) -> KnownShot:

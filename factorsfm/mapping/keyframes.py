@@ -15,25 +15,48 @@ from factorsfm.tracks.image_tracks import ImageTracks, median_flow, shared_track
 Array = NDArray[np.float64]
 
 _LEAST_SHARED = 0.7  # of the tracks of the last keyframe; with fewer, a new one is made
+_ROUGH, _CONTRADICTED, _LATELY = 1.5, 0.8, 5  # ratios of the spread of the errors, and of the share of tracks that
+# agree, to those of the best of so many images before
 
 
 def is_keyframe(
-    image: ImageTracks, last: ImageTracks, count: int, focal: float, width: int, options: MapperOptions
+    image: ImageTracks, last: ImageTracks, count: int, focal: float, width: int, options: MapperOptions, *, rough: bool
 ) -> bool:
     """Whether an image shows enough beyond the last keyframe.
 
     Args:
         count: of the keyframes so far; focal, width: of the images, pixels.
+        rough: whether the image fits suddenly worse, see `suddenly_rough`: then only where tracks run out.
     """
+    if shared_tracks(image, last) < _LEAST_SHARED * len(last.ids):
+        return True
+    if rough:
+        return False
     # A young map has the shape that the prior guessed: the first keyframes come soon. Of a camera that hardly moves,
     # ever fewer are needed.
     youth = min(1.0, 0.25 * count)
     interval = min(2 * count, options.keyframe_interval) * max(1, count // 10)
     return bool(
-        shared_tracks(image, last) < _LEAST_SHARED * len(last.ids)
-        or median_flow(image, last) * focal > youth * options.keyframe_flow * width
+        median_flow(image, last) * focal > youth * options.keyframe_flow * width
         or image.position - last.position >= interval
     )
+
+
+def suddenly_rough(image: MappedImage, before: Sequence[MappedImage]) -> bool:
+    """Whether a registered image fits the map far worse than those just before it.
+
+    Fewer of its tracks agree, and not as well. A damaged, blurred or flashed image passes, and must not bend the map.
+    Where the map itself is wrong, the images stay rough, and one of them becomes a keyframe.
+
+    Args:
+        before: all images before it, in order of time.
+    """
+    lately = [other for other in before[-_LATELY:] if other.registered]
+    if not lately:
+        return False
+    best = min(lately, key=lambda other: other.threshold)
+    share = image.inliers / len(image.tracks.ids)
+    return image.threshold > _ROUGH * best.threshold and share < _CONTRADICTED * best.inliers / len(best.tracks.ids)
 
 
 def carry(keyframe: MappedImage, before: tuple[Array, Array], followers: Sequence[MappedImage]) -> None:

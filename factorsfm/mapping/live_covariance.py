@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,36 +14,66 @@ from factorsfm.support.rotations import cross_matrices
 Array = NDArray[np.float64]
 
 _YOUNG_ERROR = 0.8  # relative, of a map that only the prior has shaped; falls with the square of the keyframes
+_MOST_PLACES = 50  # with so many a map is not young
 _SAME_PLACE = 0.02  # of the camera's displacement: keyframes nearer than that tell no more of the map's shape than one
 
 
-def live_covariance(pose: tuple[Array, Array], on_map: Array, keyframes: Sequence[MappedImage]) -> Array:
+def live_covariance(
+    pose: tuple[Array, Array],
+    on_map: Array,
+    keyframes: Sequence[MappedImage],
+    doubted_from: tuple[Array, Array] | None = None,
+) -> Array:
     """(6, 6) of a pose that was just registered (`FrameResult.covariance`).
 
     Args:
         pose: rotation (3, 3) and translation (3,), cam_from_world.
         on_map: (6, 6) what is uncertain where the map is exact.
         keyframes: those whose covariance the graph has given: what the map itself leaves open.
+        doubted_from: the pose beside it in time, where the image is rough: the whole step from there is in doubt.
     """
     rotation, translation = pose
+    if doubted_from is not None:
+        turn = rotation @ doubted_from[0].T
+        step = np.concatenate([cv2.Rodrigues(turn)[0].ravel(), translation - turn @ doubted_from[1]])
+        on_map = on_map + np.outer(step, step)
     # What linearised covariances do not know of a young map: that its whole shape is still a guess.
     places = _places(keyframes, -rotation.T @ translation)
     bent = _YOUNG_ERROR * float(np.linalg.norm(translation)) / places**2
     on_map = on_map + bent**2 * np.eye(6)
     if len(keyframes) < 2:
         return on_map
-    keyframe = keyframes[-1]
-    assert keyframe.covariance is not None
-    turn = rotation @ keyframe.pose[0].T
-    shift = translation - turn @ keyframe.pose[1]
+    assert keyframes[-1].covariance is not None
+    return on_map + carried(keyframes[-1].covariance, keyframes[-1].pose, pose)
+
+
+def window_covariance(pose: tuple[Array, Array], given: Array, constant: Sequence[MappedImage]) -> Array:
+    """(6, 6) of a keyframe's pose, the uncertainty of the constant keyframes included.
+
+    The errors of constant keyframes are nearly the same, so that all that hangs on them moves with them as one body.
+
+    Args:
+        pose: rotation (3, 3) and translation (3,), cam_from_world.
+        given: (6, 6) what is uncertain where the constant keyframes are exact.
+        constant: keyframes that the graph holds; the first of a map, which is the world, is without error.
+    """
+    held = [carried(image.covariance, image.pose, pose) for image in constant if image.covariance is not None]
+    return given + np.sum(held, axis=0) / len(constant) if held else given
+
+
+def carried(covariance: Array, origin: tuple[Array, Array], pose: tuple[Array, Array]) -> Array:
+    """(6, 6) of what is uncertain in the pose `origin`, in the camera of another pose that moves with it."""
+    turn = pose[0] @ origin[0].T
+    shift = pose[1] - turn @ origin[1]
     adjoint = np.zeros((6, 6))
     adjoint[:3, :3] = adjoint[3:, 3:] = turn
     adjoint[3:, :3] = cross_matrices(shift[None])[0] @ turn
-    return on_map + adjoint @ keyframe.covariance @ adjoint.T
+    return np.asarray(adjoint @ covariance @ adjoint.T)
 
 
 def _places(keyframes: Sequence[MappedImage], center: Array) -> int:
     """From how many places keyframes have seen the scene, on the scale of the move to `center`; at least 1."""
-    centers = np.array([-rotation.T @ translation for rotation, translation in (image.pose for image in keyframes)])
+    recent = (image.pose for image in keyframes[-_MOST_PLACES:])
+    centers = np.array([-rotation.T @ translation for rotation, translation in recent])
     steps = np.linalg.norm(np.diff(centers, axis=0), axis=1) if len(centers) > 1 else np.zeros(0)
     return 1 + int((steps > _SAME_PLACE * np.linalg.norm(center)).sum())

@@ -19,6 +19,7 @@ from factorsfm.graph.window import Window
 from factorsfm.mapping.depth_fallback import DepthGuidance
 from factorsfm.mapping.graph_window import choose_landmarks, choose_window, measured_window
 from factorsfm.mapping.landmarks import add_landmarks, mapped_landmarks, solve_alone
+from factorsfm.mapping.live_covariance import window_covariance
 from factorsfm.mapping.map_contents import MapContents
 from factorsfm.mapping.map_copy import MapCopy, MapUpdate
 from factorsfm.mapping.map_registration import fits_pose
@@ -147,8 +148,10 @@ def judged(copy: MapCopy, images: list[MappedImage], result: UpdateResult) -> Ma
         affines = dict(zip(guided, zip(d.scale.tolist(), d.shift.tolist(), strict=True), strict=True))
     units = np.array([1.0, 1.0, 1.0, unit, unit, unit])
     position = {image.tracks.frame: image.tracks.position for image in images}
+    constant = [image for image, held in zip(images, window.constant, strict=True) if held]
     covariances = {
-        position[k]: _COVARIANCE_INFLATION * c * np.outer(units, units) for k, c in result.covariance.items()
+        position[k]: window_covariance(poses[position[k]], _COVARIANCE_INFLATION * c * np.outer(units, units), constant)
+        for k, c in result.covariance.items()
     }
     errors, depth = window.reprojection()
     limit = _GROSS * max(copy.options.inlier_px, 5.0 * float(np.median(errors)))

@@ -23,6 +23,7 @@ class MappedImage:
 
     Attributes:
         inliers: tracks that agree with its pose; threshold: reprojection error up to which they do (pixels).
+        rough: whether it fits far worse than the images before it, see `suddenly_rough`.
         affine: scale and shift of its depth prior beside the map.
         covariance: (6, 6) of the pose as it was registered, or as the graph has it for a keyframe.
     """
@@ -35,6 +36,7 @@ class MappedImage:
     keyframe: bool = False
     inliers: int = 0
     threshold: float = 0.0
+    rough: bool = False
     affine: tuple[float, float] | None = None
     covariance: Array | None = None
 

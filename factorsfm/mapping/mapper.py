@@ -18,7 +18,7 @@ from factorsfm.graph.unit_of_length import unit_of_length
 from factorsfm.mapping.additions import Additions
 from factorsfm.mapping.graph_updates import submit_update
 from factorsfm.mapping.incremental import IncrementalMapper
-from factorsfm.mapping.keyframes import carry, is_keyframe
+from factorsfm.mapping.keyframes import carry, is_keyframe, suddenly_rough
 from factorsfm.mapping.landmarks import map_tracks
 from factorsfm.mapping.live_covariance import live_covariance
 from factorsfm.mapping.map_contents import MapContents
@@ -89,7 +89,7 @@ class Mapper(IncrementalMapper):
             "start_kind": self._starter.kind,
             "prior": [self._prior.lost, self._prior.mirrored, self._prior.missing],
             "images": list(self.images),
-            "points": self.points.table,
+            "points": self.points.all(),
             "additions": self.additions.state(),
             "update": update,
         }
@@ -101,7 +101,8 @@ class Mapper(IncrementalMapper):
         self._starter.kind = state["start_kind"]
         self._prior = PriorTrust(self._prior.wanted, *state["prior"])
         self.images = list(state["images"])
-        self.points = PointMap(state["points"])
+        self.points = PointMap()
+        self.points.set(*state["points"])
         self.additions.restore(state["additions"])
         if state["update"] is not None:
             self._update = Future()
@@ -310,7 +311,10 @@ class Mapper(IncrementalMapper):
     def _accept(self, image: MappedImage, found: Registration) -> None:
         super()._accept(image, found)
         solved = [self.images[k] for k in self.keyframes if self.images[k].covariance is not None]
-        image.covariance = live_covariance(image.pose, found.covariance, solved)
+        # A map of one keyframe has the shape that the prior guessed: all images are rough from the first parallax on.
+        image.rough = len(self.keyframes) > 1 and suddenly_rough(image, self.images[: image.tracks.position])
+        near = nearest_registered(self.images, image.tracks.position).pose if image.rough else None
+        image.covariance = live_covariance(image.pose, found.covariance, solved, near)
         inverse = self.points.inverse_depths(image, found.inliers)
         if len(inverse):  # the first camera is the world
             moved = np.stack([np.zeros(3), image.pose[0].T @ image.pose[1]])
@@ -321,11 +325,15 @@ class Mapper(IncrementalMapper):
         for image in self.images[:-1]:
             image.forget_tracks(ids)
 
+    def forget_unseen_points(self) -> None:
+        """Leave out the points that no image sees."""
+        self.points.keep(np.concatenate([image.tracks.ids for image in self.images]))
+
     # --- keyframes and landmarks --------------------------------------------------------------------------------
 
     def _is_keyframe(self, image: MappedImage) -> bool:
-        last = self.images[self.keyframes[-1]].tracks
-        return is_keyframe(image.tracks, last, len(self.keyframes), self.focal, self.width, self.options)
+        last, count = self.images[self.keyframes[-1]].tracks, len(self.keyframes)
+        return is_keyframe(image.tracks, last, count, self.focal, self.width, self.options, rough=image.rough)
 
     def _add_keyframe(self, image: MappedImage, read_depth: Callable[[], ImageDepth | None] | None) -> None:
         """Let the graph work on the keyframe; the map takes over its result after `graph_delay` frames."""

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.adjustment.noise import block_inflation
 from factorsfm.adjustment.residuals import camera_points, cauchy, projection_by_pose
 from factorsfm.graph.factors import image_depth_factor, image_reprojection_factor
 from factorsfm.graph.image_pose import AFFINE, POSE, solve_pose_and_affine
@@ -212,6 +213,10 @@ def _refine(
     inliers = error < threshold
     typical = float(np.median(error[inliers])) if inliers.any() else float("inf")
     covariance = covariance_of(information + 1e-9 * np.diag(information.diagonal() + 1e-12))
+    if threshold > inlier_px:  # what is wrong then is not noise: errors of neighbours are alike
+        q = points[inliers] @ rotation.T + translation
+        vectors = focal * (q[:, :2] / q[:, 2:] - observed[inliers])
+        covariance *= block_inflation(vectors, np.zeros(len(vectors), np.int64), observed[inliers])
     return Registration(rotation, translation, inliers, typical, threshold, covariance)
 
 

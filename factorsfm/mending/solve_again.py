@@ -19,7 +19,6 @@ from factorsfm.result.repeats import add_recorded
 from factorsfm.result.solved_shot import solved_shot
 from factorsfm.support.errors import InputError
 from factorsfm.support.progress import Progress
-from factorsfm.support.status import FrameStatus
 from factorsfm.support.threads import OneThreadEach
 
 
@@ -68,8 +67,8 @@ def solve_again(
         polished = measured.solved(lambda stage: progress(stage, 0, None) if progress else None)
         solved = solved_shot(measured, polished, {"polish": time.perf_counter() - begin})
     add_recorded(solved, measured.footage)
-    _take_over_frames(solved, known, changes)
     solved = in_world_of(known, solved)
+    _take_over_frames(solved, known, changes)
     solved.notes += [*_not_again(known), *changes.notes(known.measured)]
     said = {**changes.said(), "tracks": None if tracks is None else tracks.source}
     solved.options = {**known.options, "solved_again": [*known.options.get("solved_again", []), said]}
@@ -85,13 +84,12 @@ def read_with_pictures(directory: str | Path) -> Reconstruction:
 
 
 def _take_over_frames(solved: Reconstruction, known: Reconstruction, changes: Changes) -> None:
-    """The pictures of the frames, and the frames beside the shot that are not solved."""
+    """The pictures of the frames; and the frames that were not measured as they are, such as slates beside the shot."""
     by_index = {frame.index: frame for frame in known.frames}
     for frame in solved.frames:
         frame.thumbnail = by_index[frame.index].thumbnail
     there = {frame.index for frame in solved.frames}
-    beside = [frame for frame in known.frames if frame.status is FrameStatus.LEFT_OUT and frame.index not in there]
-    add_left_out(solved, [frame for frame in beside if changes.keeps(frame.index)])
+    add_left_out(solved, [f for f in known.frames if f.index not in there and changes.keeps(f.index)])
 
 
 def _not_again(known: Reconstruction) -> list[str]:

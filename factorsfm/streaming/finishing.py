@@ -15,6 +15,7 @@ from factorsfm.control.with_factors import ShotFactors
 from factorsfm.frames.recorded import RecordedFootage, RecordedFrame
 from factorsfm.graph.added_factors import AddedFactors
 from factorsfm.graph.factors_on_poses import FactorsOnPoses
+from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.mapping.mapper import Mapper
 from factorsfm.mending.joined import joined
 from factorsfm.mending.user_tracks import UserTracks
@@ -39,7 +40,7 @@ class EndedShot:
     """What a stream knows when the last frame has come.
 
     Attributes:
-        frames: as they came; mapper: has an image of each, registered on the map as it is at last.
+        frames: as they came; images: of these, registered on the map as it is at last; mapper: has made it.
         colors: (n, 3) RGB by track id.
         camera: the lens of the mapper's images; lens_given: whether it is known, and no guess.
         depth: the prior; without_depth: why it failed, by the frame's index.
@@ -50,6 +51,7 @@ class EndedShot:
     """
 
     frames: Sequence[SeenFrame]
+    images: list[MappedImage]
     mapper: Mapper
     colors: NDArray[np.uint8]
     camera: pycolmap.Camera
@@ -92,7 +94,7 @@ class EndedShot:
         measured = MeasuredShot(
             frames=[RecordedFrame(frame.index, frame.name, frame.timestamp) for frame in self.frames],
             footage=self.footage,
-            images=self.mapper.images,
+            images=self.images,
             map_points=self.mapper.points.all(),
             colors=self.colors,
             camera=self.camera,
@@ -112,13 +114,11 @@ class EndedShot:
         added = self.mapper.additions.everything()
         if not added.numbers:
             return None
-        return self._beside(
-            added, {image.tracks.position: image.pose for image in self.mapper.images if image.registered}
-        )
+        return self._beside(added, {image.tracks.position: image.pose for image in self.images if image.registered})
 
     def _beside(self, added: AddedFactors, poses: dict[int, tuple[Array, Array]]) -> ShotFactors:
         """Factors in the world of some poses, which are there by position."""
-        numbers, contents = [image.tracks.frame for image in self.mapper.images], self.mapper.contents()
+        numbers, contents = [image.tracks.frame for image in self.images], self.mapper.contents()
         return ShotFactors(
             frames=[position for position in poses if numbers[position] in added.frames],
             tracks=np.array(sorted(added.tracks), np.int64),
@@ -134,7 +134,7 @@ class EndedShot:
         if self.mapper.refines_focal and (polished.lens is None or not polished.lens.determined):
             self.imu.reason = "the lens is not known, and the shot does not determine it"
             return None
-        images, rows = self.mapper.images, polished.frames
+        images, rows = self.images, polished.frames
         poses = FramePoses.none(len(images))
         poses.rotation[rows], poses.translation[rows] = polished.state.rotation, polished.state.translation
         poses.covariance[rows] = polished.covariance
