@@ -47,6 +47,8 @@ def _rows(node: list[Item]) -> Iterator[tuple[str, Item, Item]]:
         raise ValueError("a Tracker4 node has no table of tracks")
     columns, rows = tracks[1:3]
     names = [column[3] if isinstance(column, list) and len(column) > 3 else "" for column in columns]
+    if missing := [wanted for wanted in ("name", "track_x", "track_y") if wanted not in names]:
+        raise ValueError(f"the table of a Tracker4 node has no column {missing[0]}")
     name, x, y = (names.index(wanted) for wanted in ("name", "track_x", "track_y"))
     for row in rows:
         if not isinstance(row, list) or len(row) <= max(name, x, y) or not isinstance(row[name], str):

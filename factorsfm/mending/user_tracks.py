@@ -172,18 +172,24 @@ def _of_3de(text: str) -> _Curves:
     lines = iter(line for line in text.splitlines() if line.strip())
     found: _Curves = {}
     try:
-        for _ in range(int(next(lines))):
-            name = next(lines)
+        for _ in range(_count(next(lines), "tracks")):
+            name = next(lines).strip()
             next(lines)
             if name in found:
                 raise ValueError(f'track "{name}" is there twice')
             found[name] = {}
-            for _ in range(int(next(lines))):
-                number, x, y = next(lines).split()[:3]
-                _add(found[name], name, number, x, y, f'track "{name}"')
+            for _ in range(_count(next(lines), f'places of track "{name}"')):
+                number, x, y = (*next(lines).split(), "", "", "")[:3]
+                _add(found[name], name, number, x, y, f'a line of track "{name}"')
     except StopIteration:
         raise ValueError("the text ends before its last track does") from None
     return found
+
+
+def _count(text: str, what: str) -> int:
+    if not text.strip().isdecimal():
+        raise ValueError(f'"{text.strip()}" is no number of {what}')
+    return int(text)
 
 
 def _add(places: dict[int, tuple[float, float]], name: str | None, number: str, x: str, y: str, where: str) -> None:

@@ -98,9 +98,11 @@ def test_a_script_of_nuke(tmp_path: Path) -> None:
         ("track,frame,x,y\na,1,2,3\na,1,2,3\n", 'track "a" has frame 1 twice'),
         ("track,frame,x,y\n ,1,2,3\n", "a name in one line"),
         ("2\na\n0\n1\n1 2 3\n", "the text ends before its last track"),
-        ("1\na\n0\n1\n1 2\n", "not enough values"),
+        ("1\na\n0\n1\n1 2\n", "a line of track \"a\" is '1', '2', ''; a frame and two numbers are expected"),
+        ("1\na\n0\nmany\n1 2 3\n", '"many" is no number of places of track "a"'),
         ("Tracker4 {\n tracks { { 1 2 3 }\n", "not closed"),
         ("Tracker4 {\n name a\n}\n", "no table of tracks"),
+        (NUKE.replace("track_y track_y", "y y"), "no column track_y"),
         (NUKE.replace("curve x1001 10 11.5", "curve {parent.x}"), "an expression"),
     ],
 )
