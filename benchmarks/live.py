@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -177,7 +178,10 @@ def shot_table(runs: Sequence[Measured]) -> str:
 
 
 def long_stream(count: int) -> str:
-    """Table of a rendered camera that moves back and forth for `count` frames: cost per frame, memory and drift."""
+    """Table of a rendered camera that moves back and forth for `count` frames: cost per frame, memory and drift.
+
+    After the last frame the view is lost, and the first frame comes again.
+    """
     shot = render_shot("truck", 60, 960, 540)
     latency: list[float] = []
     memory: dict[int, float] = {}
@@ -187,8 +191,14 @@ def long_stream(count: int) -> str:
             start = time.perf_counter()
             updates.append(stream.push(frame))
             latency.append(time.perf_counter() - start)
-            if k in (_WARM_UP_FRAMES, count - 1):
+            if k in (_WARM_UP_FRAMES, count // 2, count - 1):
                 memory[k] = resident_mb()
+        with tempfile.NamedTemporaryFile() as file:
+            stream.save(file.name)
+            snapshot_mb = Path(file.name).stat().st_size / 1e6
+        blank = np.zeros_like(shot.images[0])
+        stream.push(Frame(count, blank, "blank"))
+        again = stream.push(Frame(count + 1, shot.images[0], "again"))
     early, late = np.mean(latency[200:700]), np.mean(latency[-500:])  # seconds
     order = [k for k, _ in zip(_turns(len(shot.images)), range(count), strict=False)]
     truth = [shot.cam_from_world[k] for k in order]
@@ -202,7 +212,10 @@ def long_stream(count: int) -> str:
         ["ms per frame, the last 500", f"{1e3 * late:.1f}"],
         ["ratio", f"{late / early:.2f}"],
         [f"resident memory after frame {_WARM_UP_FRAMES}, MB", f"{memory[_WARM_UP_FRAMES]:.0f}"],
+        ["resident memory half way, MB", f"{memory[count // 2]:.0f}"],
         ["resident memory at the end, MB", f"{memory[count - 1]:.0f}"],
+        ["snapshot at the end, MB", f"{snapshot_mb:.0f}"],
+        ["the first view after a gap", again.message],
         ["median ATE of frames 200 to 700, % of the path", f"{100 * halves[0] / path:.3f}"],
         ["median ATE of the last 500 frames, % of the path", f"{100 * halves[1] / path:.3f}"],
     ]

@@ -14,6 +14,7 @@ from factorsfm.support.rotations import cross_matrices
 Array = NDArray[np.float64]
 
 _YOUNG_ERROR = 0.8  # relative, of a map that only the prior has shaped; falls with the square of the keyframes
+_MOST_PLACES = 50  # with so many a map is not young
 _SAME_PLACE = 0.02  # of the camera's displacement: keyframes nearer than that tell no more of the map's shape than one
 
 
@@ -42,7 +43,8 @@ def live_covariance(
     on_map = on_map + bent**2 * np.eye(6)
     if len(keyframes) < 2:
         return on_map
-    return on_map + _carried(keyframes[-1], pose)
+    assert keyframes[-1].covariance is not None
+    return on_map + carried(keyframes[-1].covariance, keyframes[-1].pose, pose)
 
 
 def window_covariance(pose: tuple[Array, Array], given: Array, constant: Sequence[MappedImage]) -> Array:
@@ -55,23 +57,23 @@ def window_covariance(pose: tuple[Array, Array], given: Array, constant: Sequenc
         given: (6, 6) what is uncertain where the constant keyframes are exact.
         constant: keyframes that the graph holds; the first of a map, which is the world, is without error.
     """
-    carried = [_carried(keyframe, pose) for keyframe in constant if keyframe.covariance is not None]
-    return given + np.sum(carried, axis=0) / len(constant) if carried else given
+    held = [carried(image.covariance, image.pose, pose) for image in constant if image.covariance is not None]
+    return given + np.sum(held, axis=0) / len(constant) if held else given
 
 
-def _carried(keyframe: MappedImage, pose: tuple[Array, Array]) -> Array:
-    """(6, 6) of what is uncertain in a keyframe's pose, in the camera of another pose that moves with it."""
-    assert keyframe.covariance is not None
-    turn = pose[0] @ keyframe.pose[0].T
-    shift = pose[1] - turn @ keyframe.pose[1]
+def carried(covariance: Array, origin: tuple[Array, Array], pose: tuple[Array, Array]) -> Array:
+    """(6, 6) of what is uncertain in the pose `origin`, in the camera of another pose that moves with it."""
+    turn = pose[0] @ origin[0].T
+    shift = pose[1] - turn @ origin[1]
     adjoint = np.zeros((6, 6))
     adjoint[:3, :3] = adjoint[3:, 3:] = turn
     adjoint[3:, :3] = cross_matrices(shift[None])[0] @ turn
-    return adjoint @ keyframe.covariance @ adjoint.T
+    return np.asarray(adjoint @ covariance @ adjoint.T)
 
 
 def _places(keyframes: Sequence[MappedImage], center: Array) -> int:
     """From how many places keyframes have seen the scene, on the scale of the move to `center`; at least 1."""
-    centers = np.array([-rotation.T @ translation for rotation, translation in (image.pose for image in keyframes)])
+    recent = (image.pose for image in keyframes[-_MOST_PLACES:])
+    centers = np.array([-rotation.T @ translation for rotation, translation in recent])
     steps = np.linalg.norm(np.diff(centers, axis=0), axis=1) if len(centers) > 1 else np.zeros(0)
     return 1 + int((steps > _SAME_PLACE * np.linalg.norm(center)).sum())

@@ -89,7 +89,7 @@ class Mapper(IncrementalMapper):
             "start_kind": self._starter.kind,
             "prior": [self._prior.lost, self._prior.mirrored, self._prior.missing],
             "images": list(self.images),
-            "points": self.points.table,
+            "points": self.points.all(),
             "additions": self.additions.state(),
             "update": update,
         }
@@ -101,7 +101,8 @@ class Mapper(IncrementalMapper):
         self._starter.kind = state["start_kind"]
         self._prior = PriorTrust(self._prior.wanted, *state["prior"])
         self.images = list(state["images"])
-        self.points = PointMap(state["points"])
+        self.points = PointMap()
+        self.points.set(*state["points"])
         self.additions.restore(state["additions"])
         if state["update"] is not None:
             self._update = Future()
@@ -323,6 +324,10 @@ class Mapper(IncrementalMapper):
         """Leave some tracks out of the images before the newest, which the graph may be working on."""
         for image in self.images[:-1]:
             image.forget_tracks(ids)
+
+    def forget_unseen_points(self) -> None:
+        """Leave out the points that no image sees."""
+        self.points.keep(np.concatenate([image.tracks.ids for image in self.images]))
 
     # --- keyframes and landmarks --------------------------------------------------------------------------------
 

@@ -42,6 +42,12 @@ class PointMap:
         """Forget the positions of some tracks."""
         self._points[ids[ids < len(self._points)]] = np.nan
 
+    def keep(self, ids: Index) -> None:
+        """Forget the positions of all other tracks; ids may repeat."""
+        others = np.ones(len(self._points), bool)
+        others[ids[ids < len(self._points)]] = False
+        self._points[others] = np.nan
+
     def copy(self) -> PointMap:
         """An independent copy."""
         return PointMap(self._points)

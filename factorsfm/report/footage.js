@@ -89,6 +89,7 @@ function drawTracks(prepared, position) {
     context.lineTo(x(o) + pixel * tracks.residual[2 * o], y(o) + pixel * tracks.residual[2 * o + 1]);
     context.stroke();
   }
+  drawPointed(prepared, position);
 }
 
 // ---- depth -----------------------------------------------------------------------------------------------
@@ -198,13 +199,13 @@ function drawStrip() {
   }
 }
 
-const drawFootageAll = () => { drawFootage(); drawDepths(); drawStrip(); };
+const drawFootageAll = () => { drawFootage(); drawPointedAlone(); drawDepths(); drawStrip(); };
 const drawFootageCoalesced = coalesced(drawFootageAll);
 function drawFootageLater() { drawFootageCoalesced(); }
 
 function startFootage() {
   const aspect = data.width ? `${data.width} / ${data.height}` : "16 / 9";
-  for (const id of ["footage", "solved_depth", "prior_depth", "depth_scatter"]) byId(id).style.aspectRatio = aspect;
+  for (const id of ["footage", "pointed", "solved_depth", "prior_depth", "depth_scatter"]) byId(id).style.aspectRatio = aspect;
   byId("residuals_label").textContent = `residuals, ${magnified} times longer`;
   for (const id of ["show_tracks", "show_residuals", "show_moving"]) byId(id).addEventListener("change", drawFootageLater);
   const strip = byId("strip");

@@ -29,7 +29,7 @@ function drawAll() {
 
 byId("scene_card").hidden = byId("scene_hint").hidden = !solved;
 byId("footage_card").hidden = !hasThumbnails && !hasTracks;
-byId("tracks_controls").hidden = !hasTracks;
+byId("tracks_controls").hidden = byId("tracks_section").hidden = !hasTracks;
 byId("moving_control").hidden = !moving;
 if (!solved) byId("footage_title").textContent = "Footage";
 byId("depth_section").hidden = withPrior.every(position => position < 0);
@@ -41,6 +41,7 @@ if (frameCount) {
   startFootage();
   if (solved) startScene();
   if (alignable) startAligning();
+  if (hasTracks) startList();
   startCharts();
   seek.followers.push(showStatus);
   slider.addEventListener("input", () => goTo(Number(slider.value)));

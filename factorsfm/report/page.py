@@ -23,12 +23,16 @@ from factorsfm.result.summary import focal_range, with_total
 from factorsfm.result.verdict import Grade, verdict_of
 from factorsfm.support.program import PROGRAM, program_version
 
-_SCRIPTS = ("base.js", "view.js", "footage.js", "align.js", "charts.js", "page.js")
+_SCRIPTS = ("base.js", "view.js", "footage.js", "align.js", "tracks.js", "charts.js", "page.js")
 _LIBRARIES = ("gtsam", "pycolmap", "opencv-python-headless", "onnxruntime", "numpy")
 
 
-def report_html(reconstruction: Reconstruction) -> str:
-    """The report as one HTML document that contains all styles, scripts and data."""
+def report_html(reconstruction: Reconstruction, folder: str | None = None) -> str:
+    """The report as one HTML document that contains all styles, scripts and data.
+
+    Args:
+        folder: of the result, as the user calls it, where the shot can be solved again from it.
+    """
     return _document(
         grade=verdict_of(reconstruction).grade,
         verdict=verdict_sentence(reconstruction),
@@ -38,7 +42,7 @@ def report_html(reconstruction: Reconstruction) -> str:
         frames=reconstruction.frames,
         seconds=reconstruction.seconds,
         options=reconstruction.options,
-        data=reconstruction_data(reconstruction),
+        data={**reconstruction_data(reconstruction), "folder": folder},
     )
 
 

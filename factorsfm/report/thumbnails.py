@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import logging
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from factorsfm.export.footage import frames_of
 from factorsfm.export.options import ExportOptions
 from factorsfm.export.shot import Defaults, make_shot
+from factorsfm.report.document import data_of
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.support.context import Closing
 from factorsfm.support.errors import InputError
@@ -105,6 +107,18 @@ def _done(jpeg: bytes) -> Future[bytes]:
     done: Future[bytes] = Future()
     done.set_result(jpeg)
     return done
+
+
+def take_from_report(result: Reconstruction, report: Path) -> None:
+    """Give a result that was read back the thumbnails of its report, as far as there are some."""
+    try:
+        content = data_of(report.read_text(encoding="utf-8"))
+        pictures = dict(zip(content["frame"], content["thumbnail"], strict=True))
+        for frame in result.frames:
+            kept = pictures.get(frame.index)
+            frame.thumbnail = base64.b64decode(kept, validate=True) if kept else None
+    except (OSError, ValueError, LookupError, TypeError) as error:  # a report without pictures is one, too
+        logger.info("no thumbnails: %s", error)
 
 
 def retake(result: Reconstruction, footage: Path | None = None, width: int = _WIDTH) -> None:

@@ -23,8 +23,9 @@ _VIEWS_PER_IMAGE = 8  # keyframes compared with one image; the next image is com
 
 @dataclass(frozen=True, slots=True)
 class KeyframeView:
-    """What a keyframe saw: its tracks and their descriptors."""
+    """What a keyframe saw: its tracks and their descriptors; `position` of its image."""
 
+    position: int
     ids: Index
     descriptors: Descriptors
 
@@ -36,11 +37,15 @@ class Relocalizer:
         self.views = list(views)
         self.next_view = next_view  # with which the next image is compared first
 
-    def remember(self, grey: NDArray[np.uint8], ids: Index, xy: NDArray[np.float64]) -> None:
-        """Keep a keyframe: (h, w) image, its track ids and their positions (n, 2) in pixels."""
+    def remember(self, position: int, grey: NDArray[np.uint8], ids: Index, xy: NDArray[np.float64]) -> None:
+        """Keep a keyframe: position and (h, w) image, its track ids and their positions (n, 2) in pixels."""
         reduced, scale = reduced_image(grey)
         kept, descriptors = _describe(reduced, at_scale(xy, scale))
-        self.views.append(KeyframeView(ids[kept], descriptors))
+        self.views.append(KeyframeView(position, ids[kept], descriptors))
+
+    def keep(self, views: Sequence[KeyframeView]) -> None:
+        """Forget all other views."""
+        self.views, self.next_view = list(views), 0
 
     def find(self, grey: NDArray[np.uint8], xy: NDArray[np.float64]) -> tuple[Index, NDArray[np.intp]]:
         """Remembered tracks among the corners of an image.

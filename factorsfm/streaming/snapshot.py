@@ -28,7 +28,7 @@ from factorsfm.support.errors import InputError
 from factorsfm.support.status import FrameStatus
 from factorsfm.tracks.image_tracks import ImageTracks
 
-_MAGIC = b"factorsfm-1\n"
+_MAGIC = b"factorsfm-2\n"
 _CHECKSUM_BYTES = 32
 _DTYPES = {"bool", "uint8", "int32", "int64", "uint64", "float32", "float64"}
 _TYPES: dict[str, Any] = {
@@ -102,8 +102,9 @@ class _Writer:
         if isinstance(value, np.generic):
             return value.item()
         if isinstance(value, np.ndarray):
-            self.chunks.append(np.ascontiguousarray(value).tobytes())
-            return {"array": value.dtype.name, "shape": value.shape}
+            stored = _compact(value)
+            self.chunks.append(np.ascontiguousarray(stored).tobytes())
+            return {"array": stored.dtype.name, "shape": value.shape, "as": value.dtype.name}
         if isinstance(value, list | tuple):
             return {type(value).__name__: [self.packed(item) for item in value]}
         if isinstance(value, Mapping):
@@ -134,7 +135,7 @@ class _Reader:
         if not isinstance(packed, dict):
             return packed
         if "array" in packed:
-            return self._array(packed["array"], packed["shape"])
+            return self._array(packed["array"], packed["shape"]).astype(_dtype(packed["as"]))
         if "list" in packed:
             return [self.value(item) for item in packed["list"]]
         if "tuple" in packed:
@@ -152,10 +153,24 @@ class _Reader:
         return _TYPES[packed["type"]](packed["value"])
 
     def _array(self, dtype: str, shape: list[int]) -> NDArray[Any]:
-        if dtype not in _DTYPES:
-            raise ValueError(f"arrays of {dtype} are not expected")
         if any(length < 0 for length in shape):
             raise ValueError(f"an array of shape {shape}")
-        size = math.prod(shape) * np.dtype(dtype).itemsize
+        size = math.prod(shape) * _dtype(dtype).itemsize
         begin, self._position = self._position, self._position + size
-        return np.frombuffer(self._data[begin : self._position], dtype).reshape(shape).copy()
+        return np.frombuffer(self._data[begin : self._position], dtype).reshape(shape)
+
+
+def _dtype(name: str) -> np.dtype[Any]:
+    if name not in _DTYPES:
+        raise ValueError(f"arrays of {name} are not expected")
+    return np.dtype(name)
+
+
+def _compact(array: NDArray[Any]) -> NDArray[Any]:
+    """The same values in half of the bytes, where these hold them exactly: tracks are measured in single precision."""
+    half = {"float64": np.float32, "int64": np.int32}.get(array.dtype.name)
+    if half is None:
+        return array
+    with np.errstate(over="ignore", invalid="ignore"):
+        stored = array.astype(half)
+    return stored if np.array_equal(stored, array, equal_nan=array.dtype.kind == "f") else array

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from contextlib import ExitStack
-from dataclasses import astuple
+from dataclasses import asdict, astuple
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +20,16 @@ from factorsfm.graph.process import GraphProcess
 from factorsfm.inertial.recording import ImuRecording
 from factorsfm.lens.camera_model import distortion_of
 from factorsfm.mapping.mapper import Mapper
+from factorsfm.mending.user_tracks import UserTracks
 from factorsfm.priors.depth import DepthPrior
 from factorsfm.priors.image_depth import ImageDepth
 from factorsfm.priors.masks import MaskPrior
-from factorsfm.priors.read_priors import read_depth, read_mask
+from factorsfm.priors.read_priors import read_mask
 from factorsfm.report.thumbnails import Thumbnails
+from factorsfm.result.lost_frames import with_large_steps
 from factorsfm.result.reconstruction import Reconstruction
+from factorsfm.result.repeats import add_recorded, add_results
+from factorsfm.streaming.depth_reader import DepthReader
 from factorsfm.streaming.finishing import EndedShot
 from factorsfm.streaming.footage import Footage
 from factorsfm.streaming.frame_update import (
@@ -40,13 +43,13 @@ from factorsfm.streaming.frame_update import (
     mark_blank,
     pose_of,
 )
+from factorsfm.streaming.horizon import FRAMES, Horizon, recent
 from factorsfm.streaming.imu_source import ImuSource, restore_imu
-from factorsfm.streaming.lost_frames import with_large_steps
 from factorsfm.streaming.snapshot import read_snapshot, write_snapshot
 from factorsfm.streaming.suspicion import Suspicion
 from factorsfm.streaming.view_finder import ViewFinder
 from factorsfm.support.context import Closing
-from factorsfm.support.errors import InputError, ModelError, ReconstructionError
+from factorsfm.support.errors import InputError, ReconstructionError
 from factorsfm.support.options import Options
 from factorsfm.support.progress import Progress
 from factorsfm.support.stages import StageSeconds
@@ -56,9 +59,7 @@ from factorsfm.tracks.colors import TrackColors
 from factorsfm.tracks.flow import FlowTracker
 from factorsfm.tracks.image_tracks import ImageTracks
 
-logger = logging.getLogger(__name__)
-
-_STATE = ("camera", "_size", "_lens_given", "_without_depth")
+_STATE = ("camera", "_size", "_lens_given")
 
 
 class Stream(Closing):
@@ -73,6 +74,8 @@ class Stream(Closing):
         control: what is known beforehand of poses and points; it takes part in `finish`. Not part of snapshots.
         imu: recording of an IMU on the camera, which gives metric scale and gravity; the frames need times. With it the
             letters v, b and g of variables are taken.
+        horizon: number of frames that `finish` polishes; those before keep their live poses, and of what they saw what
+            finds their view again. None is all; control, an IMU and factors of the caller also keep all.
 
     Example:
         >>> stream = factorsfm.Stream(camera, depth=factorsfm.DepthModel("model.onnx"))  # doctest: +SKIP
@@ -90,6 +93,7 @@ class Stream(Closing):
         options: Options | None = None,
         control: Control | None = None,
         imu: ImuRecording | None = None,
+        horizon: int | None = FRAMES,
     ) -> None:
         if control is not None and imu is not None:
             raise InputError("control and an IMU cannot both set the scale; give one of them")
@@ -99,17 +103,17 @@ class Stream(Closing):
         self.options = options or Options()
         self.seconds = StageSeconds()
         self.frames: list[SeenFrame] = []
-        self._depth = depth if self.options.uses_depth else None
+        self._depth = DepthReader(depth if self.options.uses_depth else None)
         self._held, self._closed = ExitStack(), False
         self._tracker = self._held.enter_context(FlowTracker(self.options.tracker))
         self._suspicion = self._held.enter_context(Suspicion(masks, self.options.mapper.min_tracks))
         self._finder = ViewFinder(self._tracker)
+        self._horizon = Horizon(horizon if control is None and imu is None else None)
         self._thumbnails = self._held.enter_context(Thumbnails())
         self._graph = self._held.enter_context(GraphProcess())  # it starts while the source opens
         self._mapper: Mapper | None = None
         self._size = (0, 0)
         self._colors = TrackColors()
-        self._without_depth: dict[int, str] = {}  # why the prior failed, by the frame's index
         self._indices = FrameIndices()
         self._footage = Footage()
 
@@ -161,6 +165,7 @@ class Stream(Closing):
             mapper.forget_tracks(mapper.burn_ins)
         with self.seconds.of("relocalization"):
             self._finder.keep_in_sight(mapper, image, grey)
+        self._horizon.follow(mapper, self._finder.relocalizer)
         if image.status is not FrameStatus.WAITING:  # it may still take part in the start
             mark_blank(mapper, len(self.frames) - 1, tracked.texture)
         return self._footage.told(frame_update(frame, image, mapper, self.frames, focal_changed=focal_changed))
@@ -173,7 +178,7 @@ class Stream(Closing):
         if self._mapper is None:
             return []
         self._mapper.refresh()
-        return self._footage.with_repeats([pose_of(image) for image in self._mapper.images])
+        return self._footage.recorded.with_repeats([pose_of(image) for image in self._mapper.images])
 
     def graph(self) -> LiveGraph:
         """A copy of the live factor graph, and its values; both empty before the second keyframe.
@@ -234,7 +239,7 @@ class Stream(Closing):
     def all_tracks(self) -> list[ImageTracks]:
         """The tracks of every frame so far, whether the map holds them or not; a repeated frame has its twin's."""
         images = self._mapper.images if self._mapper is not None else []
-        return self._footage.with_repeats([image.tracks for image in images])
+        return self._footage.recorded.with_repeats([image.tracks for image in images])
 
     @property
     def track_ids(self) -> NDArray[np.int64]:
@@ -253,6 +258,7 @@ class Stream(Closing):
             {
                 **{name: getattr(self, name) for name in _STATE},
                 "options": self.options.to_dict(),
+                "without_depth": self._depth.failed,
                 "seconds": dict(self.seconds),
                 "frames": [astuple(frame) for frame in self.frames],
                 "tracker": self._tracker.state(),
@@ -264,18 +270,15 @@ class Stream(Closing):
                 "footage": self._footage.state(),
                 "imu": self._imu.state() if self._imu is not None else None,
                 "suspicion": self._suspicion.state(),
+                "horizon": asdict(self._horizon),
             },
         )
 
     @classmethod
     def load(
-        cls,
-        path: str | Path,
-        *,
-        depth: DepthPrior | None = None,
-        masks: MaskPrior | None = None,
-        imu: ImuRecording | None = None,
-    ) -> Stream:
+        cls, path: str | Path, *,
+        depth: DepthPrior | None = None, masks: MaskPrior | None = None, imu: ImuRecording | None = None,
+    ) -> Stream:  # fmt: skip
         """Go on where a stream was saved; the next frame to push is number `len(stream.frames)`.
 
         Args:
@@ -298,6 +301,7 @@ class Stream(Closing):
     def _restore(self, state: dict[str, Any]) -> None:
         for name in _STATE:
             setattr(self, name, state[name])
+        self._depth.failed = state["without_depth"]
         self.seconds.update(state["seconds"])
         self.frames = [SeenFrame(*frame) for frame in state["frames"]]
         self._tracker.restore(state["tracker"])
@@ -310,29 +314,31 @@ class Stream(Closing):
             self._mapper.restore(state["mapper"])
             self._indices = FrameIndices(image.tracks.frame for image in self._mapper.images)
         self._suspicion.restore(state["suspicion"])
+        self._horizon = Horizon(**state["horizon"])
         restore_imu(self._imu, state["imu"])
 
-    def finish(self, progress: Progress | None = None) -> Reconstruction:
-        """Polish over all frames and tracks.
+    def finish(self, progress: Progress | None = None, *, tracks: UserTracks | None = None) -> Reconstruction:
+        """Polish over all frames and tracks, those of the user too.
 
         Raises:
-            InputError: the control names a frame that is not there.
+            InputError: control or tracks of the user cannot be used with these frames.
             ReconstructionError: no frame could be registered, or too few points remain.
         """
         with self:
             try:
-                result = self._ended().reconstruction(progress)
+                ended = self._ended(tracks)
+                result = self._horizon.with_all(ended.reconstruction(progress), self.frames, ended.mapper.images)
             except ReconstructionError as error:
                 images = self._mapper.images if self._mapper is not None else []
                 frames = frame_results(self.frames, images)
                 self._thumbnails.attach(frames)
                 reason = with_large_steps(str(error), frames, images)
-                raise ReconstructionError(reason, self._footage.add_results(frames)) from error
+                raise ReconstructionError(reason, add_results(frames, self._footage.recorded)) from error
             self._thumbnails.attach(result.frames)
-            self._footage.add_to(result)
+            add_recorded(result, self._footage.recorded)
             return result
 
-    def _ended(self) -> EndedShot:
+    def _ended(self, tracks: UserTracks | None) -> EndedShot:
         """The shot, now that no more frames come."""
         if self._mapper is None or len(self.frames) < 2:
             raise ReconstructionError(f"frames in the shot: {len(self.frames)}, at least 2 needed")
@@ -343,10 +349,13 @@ class Stream(Closing):
         for position, seen in enumerate(self.frames):
             mark_blank(self._mapper, position, seen.texture)
         assert self.camera is not None
+        begin = self._horizon.begin
         return EndedShot(
-            frames=self.frames, mapper=self._mapper, colors=self._colors.table, camera=self.camera,
-            lens_given=self._lens_given, depth=self._depth, without_depth=self._without_depth, control=self.control,
-            imu=self._imu, footage=self._footage, options=self.options, seconds=self.seconds, suspects=suspects,
+            frames=self.frames[begin:], images=recent(self._mapper.images, begin), mapper=self._mapper,
+            colors=self._colors.table, camera=self.camera, lens_given=self._lens_given, depth=self._depth.prior,
+            without_depth=self._depth.failed, control=self.control, imu=self._imu,
+            footage=self._footage.recorded.of(range(begin, len(self.frames))), options=self.options,
+            seconds=self.seconds, suspects=suspects, tracks=tracks,
         )  # fmt: skip
 
     def close(self) -> None:
@@ -380,20 +389,9 @@ class Stream(Closing):
     def _new_mapper(self) -> Mapper:
         assert self.camera is not None
         self._held.enter_context(OneThreadEach())
-        focal, has_prior = self.camera.mean_focal_length(), self._depth is not None
+        focal, has_prior = self.camera.mean_focal_length(), self._depth.prior is not None
         return Mapper(self._graph, focal, self._size[0], self.options, has_prior=has_prior)
 
     def _read_depth(self, frame: Frame, xy: NDArray[np.float64]) -> ImageDepth | None:
-        """The prior at keypoints; once there is a map, a frame on which it fails goes without."""
-        assert self._depth is not None
-        if frame.index in self._without_depth:
-            return None
         with self.seconds.of("depth"):
-            try:
-                return read_depth(self._depth, frame, xy)
-            except ModelError as error:
-                if self._mapper is None or not self._mapper.started:
-                    raise
-                logger.warning("%s; the frame goes without", error)
-                self._without_depth[frame.index] = str(error)
-                return None
+            return self._depth.read(frame, xy, needed=self._mapper is None or not self._mapper.started)

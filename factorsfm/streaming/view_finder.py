@@ -46,7 +46,7 @@ class ViewFinder:
             grey: the image, (h, w).
         """
         if image.keyframe:
-            self.relocalizer.remember(grey, image.tracks.ids, image.tracks.pixels)
+            self.relocalizer.remember(image.tracks.position, grey, image.tracks.ids, image.tracks.pixels)
         if not mapper.started or image.registered:
             return
         ids, rows = self.relocalizer.find(grey, image.tracks.pixels)

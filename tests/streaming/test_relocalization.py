@@ -28,7 +28,7 @@ def known() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def test_the_same_view_nearer_or_farther(scale):
     image, xy, ids = known()
     relocalizer = Relocalizer()
-    relocalizer.remember(image, ids, xy)
+    relocalizer.remember(0, image, ids, xy)
     matrix = np.array([[scale, 0, 12.0], [0, scale, -7.0]])
     moved = cv2.warpAffine(image, matrix, (320, 180), flags=cv2.INTER_AREA)
     there = corners(moved)
@@ -45,8 +45,8 @@ def test_the_keyframe_that_shows_most_of_the_view_is_chosen():
     other = grey(render_shot("static", 2, 320, 180, seed=5).images[0])
     image, xy, ids = known()
     relocalizer = Relocalizer()
-    relocalizer.remember(other, np.arange(len(corners(other))), corners(other))
-    relocalizer.remember(image, ids, xy)
+    relocalizer.remember(0, other, np.arange(len(corners(other))), corners(other))
+    relocalizer.remember(0, image, ids, xy)
     found, rows = relocalizer.find(image, xy)
     assert len(found) > 0.7 * len(xy)
     assert np.mean(ids[rows] == found) > 0.95
@@ -55,7 +55,7 @@ def test_the_keyframe_that_shows_most_of_the_view_is_chosen():
 def test_a_foreign_view_is_not_found():
     image, xy, ids = known()
     relocalizer = Relocalizer()
-    relocalizer.remember(image, ids, xy)
+    relocalizer.remember(0, image, ids, xy)
     other = grey(render_shot("static", 2, 320, 180, seed=5).images[0])
     found, rows = relocalizer.find(other, corners(other))
     assert len(found) == len(rows) < 25  # up to half of the matches of a view may be wrong; all of these are
@@ -66,8 +66,8 @@ def test_many_keyframes_are_taken_in_turn():
     image, xy, ids = known()
     relocalizer = Relocalizer()
     for k, picture in enumerate(noise):
-        relocalizer.remember(picture, np.arange(50) + 100 * k, corners(picture)[:50])
-    relocalizer.remember(image, ids, xy)
+        relocalizer.remember(0, picture, np.arange(50) + 100 * k, corners(picture)[:50])
+    relocalizer.remember(0, image, ids, xy)
     attempts = [len(relocalizer.find(image, xy)[0]) for _ in range(3)]  # eight keyframes an image
     assert attempts[0] == attempts[1] == 0
     assert attempts[2] > 0.7 * len(xy)
@@ -80,8 +80,8 @@ def test_nothing_to_compare(xy):
     image, good, ids = known()
     assert [len(part) for part in Relocalizer().find(image, good)] == [0, 0]
     relocalizer = Relocalizer()
-    relocalizer.remember(image, ids, good)
+    relocalizer.remember(0, image, ids, good)
     assert [len(part) for part in relocalizer.find(image, xy)] == [0, 0]
     bare = Relocalizer()
-    bare.remember(image, np.arange(len(xy)), xy)
+    bare.remember(0, image, np.arange(len(xy)), xy)
     assert [len(part) for part in bare.find(image, good)] == [0, 0]

@@ -22,7 +22,7 @@ from tests.rendered import Maps, with_fewer_tracks
 
 FRAMES = 14
 FOREIGN = range(9, 12)  # frames of another room: the view is lost and found again
-MAGIC = b"factorsfm-1\n"
+MAGIC = b"factorsfm-2\n"
 
 
 @cache
