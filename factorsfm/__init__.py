@@ -25,6 +25,9 @@ from factorsfm.imagesets.add_images import add_images
 from factorsfm.inertial.fit import ImuFit
 from factorsfm.inertial.mounting import open_imu
 from factorsfm.inertial.recording import ImuNoise, ImuRecording
+from factorsfm.mending.changes import MaskRegion
+from factorsfm.mending.solve_again import solve_again
+from factorsfm.mending.user_tracks import UserTrack, UserTracks, read_tracks
 from factorsfm.objects.object_result import ObjectFrame, ObjectResult
 from factorsfm.polish.observability import CameraObservability
 from factorsfm.priors.depth import DepthFolder, DepthModel, DepthPrior
@@ -79,6 +82,7 @@ __all__ = [
     "MaskFolder",
     "MaskModel",
     "MaskPrior",
+    "MaskRegion",
     "ModelError",
     "Moving",
     "MovingStretch",
@@ -100,6 +104,8 @@ __all__ = [
     "Stream",
     "TrackerOptions",
     "UpAxis",
+    "UserTrack",
+    "UserTracks",
     "add_images",
     "align",
     "condensed_factor",
@@ -113,6 +119,8 @@ __all__ = [
     "read_control",
     "read_frames",
     "read_result",
+    "read_tracks",
     "reconstruct",
+    "solve_again",
     "track",
 ]

@@ -25,6 +25,7 @@ from factorsfm.imagesets.photo_folder import work_folder
 from factorsfm.inertial.mounting import open_imu
 from factorsfm.inertial.recording import ImuRecording
 from factorsfm.inputs import Inputs, Source
+from factorsfm.mending.user_tracks import UserTracks, read_tracks
 from factorsfm.objects.observed import ObservedObjects, RememberedDepth
 from factorsfm.priors.depth import DepthPrior, open_depth
 from factorsfm.priors.depth_map import DepthKind
@@ -59,6 +60,7 @@ def reconstruct(
     features: str | Path = "sift",
     work: str | Path | None = None,
     control: str | Path | Control | None = None,
+    tracks: str | Path | UserTracks | None = None,
     imu: str | Path | ImuRecording | None = None,
     progress: Progress | None = None,
 ) -> Reconstruction:
@@ -88,6 +90,8 @@ def reconstruct(
         work: folder for the features and matches of a set, from which an interrupted run goes on; None keeps nothing.
         control: what is known beforehand of poses, points, distances and heights, or its JSON file; the result is in
             the world and unit of the control then.
+        tracks: of the user in a video, which take part with a weight of their own and become named points; or their
+            file (`read_tracks`).
         imu: recording of an IMU on the camera of a video, or its file (`open_imu`); the result is metric then.
         progress: called with the stage, the frames done, and their number where it is known.
 
@@ -116,6 +120,7 @@ def reconstruct(
         objects=None if from_motion else open_objects(objects),
         from_motion=from_motion,
         control=read_control(control) if isinstance(control, str | Path) else control,
+        tracks=_read_tracks(tracks, source) if isinstance(tracks, str | Path) else tracks,
         imu=open_imu(imu) if isinstance(imu, str | Path) else imu,
         features=features,
         work=work,
@@ -127,6 +132,11 @@ def reconstruct(
         part.seconds["total"] = time.perf_counter() - begin
         part.options |= said
     return result
+
+
+def _read_tracks(path: str | Path, source: Source) -> UserTracks:
+    numbers = sequence_of(source)
+    return read_tracks(path, first_number=numbers[0] if numbers else None)
 
 
 def _check_choice(name: str, value: str, expected: tuple[str, ...]) -> None:
@@ -184,7 +194,7 @@ def _solve(
         if not stream.frames:
             raise InputError(f"no frames in {given.source}")
         given.check_matched()
-        result = stream.finish(progress)
+        result = stream.finish(progress, tracks=given.tracks)
         if (observed is not None or given.from_motion) and progress is not None:
             progress("objects", 0, None)
         with stream.seconds.of("objects"), OneThreadEach():

@@ -19,6 +19,7 @@ from factorsfm.frames.numbering import chosen, numbered_images, sequence_of
 from factorsfm.frames.ranges import checked_range, range_text
 from factorsfm.frames.reading import read_frames
 from factorsfm.inertial.recording import ImuRecording
+from factorsfm.mending.user_tracks import UserTracks
 from factorsfm.priors.depth import DepthFolder, DepthPrior
 from factorsfm.priors.masks import MaskFolder, MaskPrior
 from factorsfm.priors.object_masks import FROM_MOTION, ObjectFolder, ObjectMasks
@@ -35,7 +36,7 @@ class Inputs:
     Attributes:
         source: of the frames; frames: its range, None for all; fields, pixel_aspect: see `read_frames`.
         unordered: whether the images are in no order of time.
-        camera, depth, masks, control, imu: None where there is none.
+        camera, depth, masks, control, tracks, imu: None where there is none.
         objects: masks of things that move by themselves; from_motion: whether these are found by their motion.
         features, work: of images in any order, see `api.reconstruct`.
 
@@ -54,6 +55,7 @@ class Inputs:
     objects: ObjectMasks | None
     from_motion: bool
     control: Control | None
+    tracks: UserTracks | None
     imu: ImuRecording | None
     features: str | Path
     work: str | Path | None
@@ -63,6 +65,10 @@ class Inputs:
         self._check_control()
         if self.unordered and self.imu is not None:
             raise InputError("an IMU goes with a video; images in any order have no times")
+        if self.unordered and self.tracks is not None:
+            raise InputError("tracks of your own go with a video; images in any order are matched with each other")
+        if self.camera is None and self.tracks is not None and self.tracks.on == "undistorted":
+            raise InputError("tracks on undistorted footage need its lens; a camera, or tracks on the footage as it is")
         if self.unordered and (self.objects is not None or self.from_motion):
             raise InputError("objects are tracked in a video; images in any order show no motion")
         if self.unordered and (self.fields != "auto" or self.pixel_aspect is not None):
@@ -92,6 +98,7 @@ class Inputs:
             "source": str(self.source) if isinstance(self.source, str | Path) else "frames",
             "unordered": self.unordered,
             "features": str(self.features),
+            "tracks": None if self.tracks is None else self.tracks.source,
             "objects": FROM_MOTION if self.from_motion else _name_of(self.objects),
             **input_options(self.source, self.depth, self.masks, self.frames, self.fields, self.pixel_aspect),
         }

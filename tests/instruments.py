@@ -40,6 +40,19 @@ def write_measurements(shot: RenderedShot, folder: Path) -> None:
     angle = float(np.linalg.norm(half))
     np.savetxt(folder / "first.txt", [*origin, *(np.sin(angle) * half / angle), np.cos(angle)])
     np.savetxt(folder / "surveyed.txt", [*_surveyed_corner(shot, folder)])
+    _write_tracks(shot, folder / "tracks.csv")
+
+
+def _write_tracks(shot: RenderedShot, path: Path) -> None:
+    """Three points of the first frame, marked in all frames."""
+    camera, rows = shot.camera, ["track,frame,x,y"]
+    for name, (x, y) in (("left", (60, 60)), ("middle", (128, 80)), ("right", (190, 70))):
+        ray = np.append(normalized_from_pixels(camera, np.array([[x, y]], np.float64))[0], 1.0)
+        point = shot.cam_from_world[0].inverse() * (shot.depths[0][y, x] * ray)
+        for frame, pose in enumerate(shot.cam_from_world):
+            u, v = camera.img_from_cam(pose * point)
+            rows.append(f"{name},{frame},{u:.3f},{v:.3f}")
+    path.write_text("\n".join(rows) + "\n")
 
 
 def _surveyed_corner(shot: RenderedShot, folder: Path) -> list[float]:

@@ -63,16 +63,23 @@ class TrackErrors:
         return 0.5 * float((weighted**2).sum() - (self.sums(weighted) ** 2 * self.shared).sum())
 
 
-def measure_track_errors(residual: Array, observations: Observations, kernel: float) -> TrackErrors:
+def measure_track_errors(
+    residual: Array, observations: Observations, kernel: float, known_sigma: Array | None = None
+) -> TrackErrors:
     """The error model of some residuals.
 
     Args:
         residual: (m, 2) predicted minus observed position (pixels); observations: sorted by point and frame.
         kernel: scale of the Cauchy kernel in standard deviations of all errors.
+        known_sigma: (n,) standard deviations (pixels) of the tracks of which they are known, NaN of all others; known
+            errors are white, and say nothing of those of others.
     """
     o, size = observations, np.linalg.norm(residual, axis=1)
-    typical = coordinate_sigma(size)
-    next_frame = (np.diff(o.point) == 0) & (np.diff(o.frame) == 1)
+    known_sigma = np.full(int(o.point[-1]) + 1, np.nan) if known_sigma is None else known_sigma
+    known = np.isfinite(known_sigma)
+    measured = ~known[o.point]
+    typical = coordinate_sigma(size[measured])
+    next_frame = (np.diff(o.point) == 0) & (np.diff(o.frame) == 1) & measured[1:]
     jumps = np.linalg.norm(np.diff(residual, axis=0)[next_frame], axis=1)
     sigma = max(SMALLEST_SIGMA_PX, min(typical, typical_sigma(jumps) / np.sqrt(2.0))) if len(jumps) else typical
 
@@ -85,10 +92,12 @@ def measure_track_errors(residual: Array, observations: Observations, kernel: fl
     products = 0.5 * (np.add.reduceat(clipped, first) ** 2 - np.add.reduceat(clipped**2, first)).sum(1)
     track = o.point[first]
     common, pairs = np.bincount(track, products), np.bincount(track, count * (count - 1.0))
-    usual = max(0.0, float(common.sum() / max(pairs.sum(), 1.0)))
-    persistent = np.maximum(0.0, (_SHRINKAGE * usual + common) / (_SHRINKAGE + pairs))
+    usual = max(0.0, float(common[~known].sum() / max(pairs[~known].sum(), 1.0)))
+    persistent = np.where(known, 0.0, np.maximum(0.0, (_SHRINKAGE * usual + common) / (_SHRINKAGE + pairs)))
 
-    weight = cauchy(residual / typical, kernel)[1]
+    of_all = np.where(known, known_sigma, typical)[o.point]
+    weight = cauchy(residual / of_all[:, None], kernel)[1]
+    weight[~measured] *= (sigma / of_all[~measured]) ** 2
     ratio = persistent[track] / sigma**2
     shared = ratio / (1.0 + ratio * np.add.reduceat(weight, first))
     return TrackErrors(sigma, np.sqrt(weight), first, stretch, shared, np.sqrt(persistent))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,6 +77,13 @@ def align(
     return aligned
 
 
+def survey(result: Reconstruction) -> Literal["world", "lengths"] | None:
+    """What a result has from its control, which no alignment replaces: its world, only its lengths, or nothing."""
+    if result.control is None or result.control.source != "control":
+        return None
+    return "world" if result.control.placed else "lengths"
+
+
 def _pick(pick: Pick | str) -> Pick:
     return pick if isinstance(pick, Pick) else Pick.parse(pick)
 
@@ -85,8 +93,8 @@ def _check(
 ) -> None:
     if not result.registered:
         raise InputError("no frame of this result has a pose; there is nothing to align")
-    surveyed = result.control is not None and result.control.source == "control"
-    if surveyed and result.control is not None and result.control.placed:
+    surveyed = survey(result)
+    if surveyed == "world":
         raise InputError("the result is in the world of its control, and aligning would take it out of it")
     if surveyed and (distance is not None or camera_height is not None):
         raise InputError("the result has the lengths of its control; a further one belongs into the control file")

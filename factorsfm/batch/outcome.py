@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import base64
-import json
 import math
-import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,13 +11,13 @@ from typing import Any
 import cv2
 import numpy as np
 
+from factorsfm.report.document import data_of
 from factorsfm.result.verdict import Grade
 from factorsfm.support.errors import InputError
 from factorsfm.support.json_reading import read_json, typed
 
 _THUMBNAIL_WIDTH = 240
 _QUALITY = 70  # of JPEG
-_DATA = re.compile(r'<script type="application/json" id="data">(.*?)</script>', re.DOTALL)
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,8 +55,7 @@ def is_result_of(job: dict[str, Any], folder: Path) -> bool:
 def thumbnail(report: Path) -> bytes | None:
     """The middle picture of a report as a small JPEG, or None."""
     try:
-        match = _DATA.search(report.read_text(encoding="utf-8"))
-        pictures = [text for text in json.loads(match[1])["thumbnail"] if text] if match else []
+        pictures = [text for text in data_of(report.read_text(encoding="utf-8"))["thumbnail"] if text]
         data = base64.b64decode(pictures[len(pictures) // 2]) if pictures else b""
     except (OSError, ValueError, LookupError, TypeError):  # the report is missing or damaged
         return None

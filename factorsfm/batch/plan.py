@@ -26,7 +26,11 @@ from factorsfm.support.options import LensFreedom, ShutterUse
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """The arguments of `factorsfm.reconstruct` for all shots, with absolute paths."""
+    """The arguments of `factorsfm.reconstruct` for all shots, with absolute paths.
+
+    Attributes:
+        align: whether each result is aligned, too, see `factorsfm.align`.
+    """
 
     camera: pycolmap.Camera | None = None
     depth: str | None = None
@@ -37,6 +41,7 @@ class Method:
     lens: LensFreedom = "auto"
     shutter: ShutterUse = "auto"
     pixel_aspect: float | None = None
+    align: bool = False
 
     def of_video(self, name: str) -> Method:
         """For one of several videos: with the folders of its maps and masks."""
@@ -61,6 +66,7 @@ class Method:
             "lens": self.lens,
             "shutter": self.shutter,
             "pixel_aspect": self.pixel_aspect,
+            "align": self.align,
         }
 
 

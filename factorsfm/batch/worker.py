@@ -6,6 +6,7 @@ import time
 from contextlib import nullcontext
 
 from factorsfm import api
+from factorsfm.alignment.align import align
 from factorsfm.batch.plan import Job, Video, shots_of
 from factorsfm.report.result_folder import write_failure, write_folder
 from factorsfm.support.errors import FactorsfmError, ReconstructionError
@@ -48,6 +49,8 @@ def reconstruct_shot(job: Job, *, one_thread: bool, progress: Progress | None = 
                 pixel_aspect=method.pixel_aspect,
                 progress=progress,
             )
+            if method.align:
+                reconstruction = align(reconstruction)
     except FactorsfmError as error:
         frames = error.frames if isinstance(error, ReconstructionError) else ()
         options = {"source": str(job.video.path), "job": job.to_dict()}

@@ -14,7 +14,7 @@ from factorsfm.batch.index import Entry, Index, shots_known
 from factorsfm.batch.plan import Job, Method, Video, find_videos, plan_jobs
 from factorsfm.batch.worker import find_shots_of, reconstruct_shot
 from factorsfm.camera.files import open_camera
-from factorsfm.cli.command import Command, add_footage, add_method, add_objects, add_output, count_of
+from factorsfm.cli.command import Command, add_align, add_footage, add_method, add_objects, add_output, count_of
 from factorsfm.cli.progress_line import ProgressLine
 from factorsfm.priors.depth import open_depth
 from factorsfm.priors.masks import open_masks
@@ -37,6 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_method(parser)
     add_footage(parser)
     add_objects(parser)
+    add_align(parser)
     parser.add_argument(
         "--workers",
         type=count_of("processes"),
@@ -100,7 +101,7 @@ def _method(arguments: argparse.Namespace, *, several: bool) -> Method:
     camera = open_camera(arguments.camera)
     return Method(
         camera, depth, arguments.depth_kind, masks, objects, arguments.preset, arguments.lens, arguments.shutter,
-        arguments.pixel_aspect,
+        arguments.pixel_aspect, arguments.align,
     )  # fmt: skip
 
 

@@ -12,6 +12,7 @@ from typing import Any, get_args
 from factorsfm.cli.progress_line import ProgressLine
 from factorsfm.frames.fields import Fields
 from factorsfm.frames.ranges import parse_range
+from factorsfm.mending.user_tracks import DEFAULT_SIGMA_PX, Plate, UserTracks, read_tracks
 from factorsfm.priors.depth_map import DepthKind
 from factorsfm.report.result_folder import write_folder
 from factorsfm.result.reconstruction import Reconstruction
@@ -136,6 +137,13 @@ def add_shot(parser: argparse.ArgumentParser, *other_names: str) -> None:
     )
 
 
+def add_align(parser: argparse.ArgumentParser) -> None:
+    """Declare whether results are aligned."""
+    parser.add_argument(
+        "--align", action="store_true", help="the result stands on its ground, as factorsfm align makes it"
+    )
+
+
 def add_imu(parser: argparse.ArgumentParser) -> None:
     """Declare the recording of an IMU."""
     parser.add_argument(
@@ -143,6 +151,52 @@ def add_imu(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="FILE",
         help="recording of an IMU on the camera (CSV, .gcsv, or a JSON file that names one): the result is metric",
+    )
+
+
+def add_tracks(parser: argparse.ArgumentParser) -> None:
+    """Declare tracks of the user."""
+    parser.add_argument(
+        "--tracks",
+        type=Path,
+        metavar="FILE",
+        help="2-D tracks placed by hand or by another program, which take part with a weight of their own: a table "
+        "with track, frame, x and y, a Nuke script with Tracker4 nodes, or 3DEqualizer's text",
+    )
+    parser.add_argument(
+        "--tracks-sigma",
+        type=float,
+        default=DEFAULT_SIGMA_PX,
+        metavar="PIXELS",
+        help="standard deviation of their places (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--tracks-on",
+        choices=get_args(Plate),
+        help="the plate on which they lie (default: as export writes them: undistorted for Nuke, else footage)",
+    )
+    parser.add_argument(
+        "--tracks-first-frame",
+        type=int,
+        metavar="NUMBER",
+        help="number of the source's first frame in their file (default: as export numbers frames)",
+    )
+
+
+def tracks_of(arguments: argparse.Namespace, first_number: int | None) -> UserTracks | None:
+    """The tracks of the user; `first_number`: of a source that is a numbered sequence.
+
+    Raises:
+        InputError: they cannot be read.
+    """
+    if arguments.tracks is None:
+        return None
+    return read_tracks(
+        arguments.tracks,
+        first_number=first_number,
+        first_frame=arguments.tracks_first_frame,
+        sigma=arguments.tracks_sigma,
+        on=arguments.tracks_on,
     )
 
 

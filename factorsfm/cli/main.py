@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from logging.handlers import MemoryHandler
 from typing import Any, NoReturn
 
-from factorsfm.cli import align, batch, demo, export, extend, overlay, reconstruct, stream
+from factorsfm.cli import align, batch, demo, export, extend, overlay, reconstruct, solve, stream, view
 from factorsfm.cli.progress_line import LogHandler, ProgressLine
 from factorsfm.support.errors import FactorsfmError, ReconstructionError
 from factorsfm.support.json_text import as_text, is_text
@@ -20,7 +20,8 @@ logger = logging.getLogger(__name__)
 BAD_INPUT, NOT_RECONSTRUCTED, INTERRUPTED = 2, 3, 130
 
 _COMMANDS = {
-    module.COMMAND.name: module.COMMAND for module in (reconstruct, stream, batch, extend, align, demo, export, overlay)
+    module.COMMAND.name: module.COMMAND
+    for module in (reconstruct, stream, batch, extend, solve, view, align, demo, export, overlay)
 }
 _LOGGED = 1000  # log lines that wait for the end
 

@@ -11,18 +11,22 @@ from factorsfm.alignment.align import align
 from factorsfm.camera.files import open_camera
 from factorsfm.cli.command import (
     Command,
+    add_align,
     add_footage,
     add_imu,
     add_method,
     add_objects,
     add_output,
     add_range,
+    add_tracks,
     as_given,
     range_of,
+    tracks_of,
     unless_none,
     write_result,
 )
 from factorsfm.cli.progress_line import ProgressLine
+from factorsfm.frames.numbering import sequence_of
 from factorsfm.report.result_folder import check_directory, write_failure
 from factorsfm.support.errors import InputError, ReconstructionError
 
@@ -53,9 +57,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE.json",
         help="known poses, points, distances and heights: the result is in their world and unit",
     )
-    parser.add_argument(
-        "--align", action="store_true", help="the result stands on its ground, as factorsfm align makes it"
-    )
+    add_align(parser)
+    add_tracks(parser)
     add_imu(parser)
     parser.add_argument(
         "--work",
@@ -71,6 +74,8 @@ def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
     if arguments.align and arguments.control is not None:
         raise InputError("--align and --control are given; a result in the world of its control is not aligned")
     camera, frames = open_camera(arguments.camera), range_of(arguments)
+    numbers = sequence_of(arguments.source)
+    tracks = tracks_of(arguments, numbers[0] if numbers else None)
     begin = time.perf_counter()
     try:
         reconstruction = api.reconstruct(
@@ -90,6 +95,7 @@ def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
             features=arguments.features,
             work=arguments.work,
             control=arguments.control,
+            tracks=tracks,
             imu=arguments.imu,
             progress=progress,
         )

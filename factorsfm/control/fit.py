@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-_CONTRADICTION = 4.0  # standard deviations
+CONTRADICTION = 4.0  # standard deviations
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +27,7 @@ class ControlResidual:
     @classmethod
     def of(cls, name: str, unit: str, sigma: float, sigmas: float) -> ControlResidual:
         """An item that is off by so many standard deviations."""
-        return cls(name, unit, sigmas * sigma, sigma, sigmas, sigmas > _CONTRADICTION)
+        return cls(name, unit, sigmas * sigma, sigma, sigmas, sigmas > CONTRADICTION)
 
 
 @dataclass(frozen=True, slots=True)

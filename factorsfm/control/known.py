@@ -299,14 +299,19 @@ def read_control(path: str | Path) -> Control:
     path = Path(path)
     content = read_json(path, "control file")
     try:
-        if not isinstance(content, dict) or not set(content) <= set(_KINDS):
-            given = ", ".join(content) if isinstance(content, dict) else type(content).__name__
-            raise InputError(f"it holds {given}; an object with {', '.join(_KINDS)} is expected")
-        kinds: tuple[type, ...] = (KnownPose, MarkedPoint, KnownDistance, KnownHeight)
-        parts = {name: _items(content.get(name, []), name, kind) for name, kind in zip(_KINDS, kinds, strict=True)}
-        return Control(**parts)
+        return control_of(content)
     except InputError as error:
         raise InputError(f"control file {path}: {error}") from error
+
+
+def control_of(content: Any) -> Control:
+    """Control from the content of its file, which is also that of its `asdict` as JSON; errors as in `read_control`."""
+    if not isinstance(content, dict) or not set(content) <= set(_KINDS):
+        given = ", ".join(content) if isinstance(content, dict) else type(content).__name__
+        raise InputError(f"it holds {given}; an object with {', '.join(_KINDS)} is expected")
+    kinds: tuple[type, ...] = (KnownPose, MarkedPoint, KnownDistance, KnownHeight)
+    parts = {name: _items(content.get(name, []), name, kind) for name, kind in zip(_KINDS, kinds, strict=True)}
+    return Control(**parts)
 
 
 def _items(values: Any, name: str, kind: type) -> list[Any]:

@@ -51,7 +51,7 @@ def write_after_effects(shot: Shot, folder: Path) -> None:
                 _track(_ORIENTATION, _DEGREES, thing.numbers, angles_zyx(thing.world_from_object[:, :3, :3])),
             ],
         )
-        for thing in shot.objects
+        for thing in shot.nulls
     ]
     for name, tracks in ((CAMERA, camera), (FOOTAGE, footage), *objects):
         # Line ends as in After Effects' own keyframe data.

@@ -25,18 +25,19 @@ def write_alembic(shot: Shot, path: Path) -> None:
     """
     abc, geom, core = (require(f"alembic3d.{name}") for name in ("Abc", "AbcGeom", "AbcCoreAbstract"))
     imath = require("imath")
-    samples = len(shot.numbers) + sum(len(thing.numbers) for thing in shot.objects)
-    points = len(shot.reconstruction.points) + sum(len(thing.points) for thing in shot.objects)
+    samples = len(shot.numbers) + sum(len(thing.numbers) for thing in shot.nulls)
+    points = len(shot.reconstruction.points) + sum(len(thing.points) for thing in shot.nulls)
     _check_room(path, 64 * 1024 + 1024 * samples + 64 * points)
     with failures_as_os_errors():
         archive = abc.OArchive(str(path), asOgawa=True)
         sampling = archive.addTimeSampling(_sampling(shot.numbers, shot.fps, core))
         _write_camera(shot, archive, sampling, geom, imath)
         _write_points(archive.getTop(), shot.reconstruction.points, shot.reconstruction.colors, geom, imath)
-        for thing in shot.objects:
+        for thing in shot.nulls:
             sampling = archive.addTimeSampling(_sampling(thing.numbers, shot.fps, core))
             null = _write_transform(archive, thing.name, sampling, thing.world_from_object, geom, imath)
-            _write_points(null, thing.points, thing.colors, geom, imath)
+            if len(thing.points):
+                _write_points(null, thing.points, thing.colors, geom, imath)
 
 
 def _sampling(numbers: list[int], fps: float, core: Any) -> Any:

@@ -82,7 +82,8 @@ def add_points(name, points, colors):
 
 add_points("factorsfm points", DATA["points"], DATA["colors"])
 for thing, null in zip(DATA["objects"], moving):
-    add_points(thing["name"] + " points", thing["points"], thing["colors"]).parent = null
+    if thing["points"]:
+        add_points(thing["name"] + " points", thing["points"], thing["colors"]).parent = null
 
 footage = DATA["footage"]
 if footage:
@@ -149,7 +150,7 @@ def _data(shot: Shot) -> dict[str, Any]:
                 "points": thing.points.tolist(),
                 "colors": _colors(thing.colors),
             }
-            for thing in shot.objects
+            for thing in shot.nulls
         ],
         "footage": _footage(shot),
     }

@@ -29,8 +29,8 @@ class _Observations(NamedTuple):
 def write_colmap(reconstruction: Reconstruction, folder: str | Path) -> None:
     """Write ``cameras.txt``, ``images.txt`` and ``points3D.txt``; the folder is made if absent.
 
-    There is one camera for each lens of the registered frames. The image id is the frame index + 1, the point id the
-    row in ``reconstruction.points`` + 1. Points seen from fewer than two registered frames are left out. Pixel centres
+    There is one camera for each lens of the registered frames. The image id is the frame index + 1, the point id that
+    of its track + 1. Points seen from fewer than two registered frames are left out. Pixel centres
     are at 0.5, as everywhere in COLMAP. The text format cannot hold white space in an image name. If a name has some,
     the binary files are written as well, which readers prefer.
     """
@@ -101,8 +101,10 @@ def _image_lines(
     reconstruction: Reconstruction, observations: _Observations, cameras: list[pycolmap.Camera]
 ) -> list[str]:
     points2d = [
-        f"{x:.6f} {y:.6f} {point + 1}"
-        for (x, y), point in zip(observations.xy.tolist(), observations.point.tolist(), strict=True)
+        f"{x:.6f} {y:.6f} {track + 1}"
+        for (x, y), track in zip(
+            observations.xy.tolist(), reconstruction.track_ids[observations.point].tolist(), strict=True
+        )
     ]
     bounds = np.searchsorted(observations.frame, np.arange(len(reconstruction.frames) + 1))
     lines = []
@@ -132,7 +134,9 @@ def _point_lines(reconstruction: Reconstruction, observations: _Observations) ->
     for point, start, stop in zip(points, starts, stops, strict=True):
         xyz = map(_exact, reconstruction.points[point])
         rgb = reconstruction.colors[point]
-        lines.append(_join((point + 1, *xyz, *rgb, f"{errors[point]:.6g}", *tracks[start:stop])))
+        lines.append(
+            _join((reconstruction.track_ids[point] + 1, *xyz, *rgb, f"{errors[point]:.6g}", *tracks[start:stop]))
+        )
     return lines
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.export.footage import Sequence, background
+from factorsfm.export.nulls import Null
 from factorsfm.export.rotation import angles_zxy
 from factorsfm.export.shot import Lens, Shot
 from factorsfm.export.stmap import DISTORT, UNDISTORT, write_stmaps
@@ -48,11 +49,12 @@ def write_nuke(shot: Shot, folder: Path) -> None:
     The script undistorts the footage with one STMap and renders the points over the undistorted plate. Beside that, it
     distorts the render with the other STMap and lays it over the original footage. A lens without distortion has no
     STMaps. The principal point is in the camera's window translation, the aspect of its
-    pixels in the format. An object is an axis that moves its points. Unregistered frames have no
+    pixels in the format. An object is an axis that moves its points,
+    a named point an axis alone. Unregistered frames have no
     key; a note lists them.
     """
     (folder / POINTS).write_text(_tetrahedra(shot.reconstruction.points, shot.point_size), encoding="ascii")
-    for thing in shot.objects:
+    for thing in _with_points(shot):
         (folder / f"{thing.name}.obj").write_text(_tetrahedra(thing.points, shot.point_size), encoding="ascii")
     if shot.distorts:
         write_stmaps(shot, folder)
@@ -155,11 +157,16 @@ def _camera(shot: Shot) -> str:
     )
 
 
+def _with_points(shot: Shot) -> list[Null]:
+    return [null for null in shot.nulls if len(null.points)]
+
+
 def _objects(shot: Shot) -> list[str]:
-    """An axis for each object, its points moved by it, and a scene of all points in the place of those of the scene."""
-    parts = []
-    for thing in shot.objects:
-        parts += [
+    """An axis for each object and named point, the points of objects moved by it, and a scene of all points in the
+    place of those of the scene."""
+    parts, moved = [], _with_points(shot)
+    for thing in shot.nulls:
+        parts.append(
             _node(
                 "Axis2",
                 inputs=0,
@@ -167,16 +174,20 @@ def _objects(shot: Shot) -> list[str]:
                 translate=_curves(thing.numbers, thing.world_from_object[:, :3, 3]),
                 rotate=_curves(thing.numbers, angles_zxy(thing.world_from_object[:, :3, :3])),
                 name=thing.name,
-            ),
+            )
+        )
+        if not len(thing.points):
+            continue
+        parts += [
             _node("ReadGeo2", inputs=0, file=f'"{_BESIDE_SCRIPT}{thing.name}.obj"', name=f"{thing.name}_points"),
             _node("TransformGeo", inputs=2, name=f"{thing.name}_moved"),
             f"set {thing.name} [stack 0]",
         ]
-    if parts:
+    if moved:
         parts += [
-            *(f"push ${thing.name}" for thing in shot.objects),
+            *(f"push ${thing.name}" for thing in moved),
             "push $points",
-            _node("Scene", inputs=len(shot.objects) + 1, name="AllPoints"),
+            _node("Scene", inputs=len(moved) + 1, name="AllPoints"),
             "set points [stack 0]",
         ]
     return parts

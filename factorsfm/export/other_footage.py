@@ -39,16 +39,21 @@ class Numbering:
     timeline: int | None
 
 
+def of_source(first_number: int | None) -> Numbering:
+    """Without other footage; `first_number`: of a source that is a numbered sequence."""
+    first = first_number or 0
+    return Numbering(first, first, 0, None if first_number is None else 0)
+
+
 def match_numbers(reconstruction: Reconstruction, footage: Path | None) -> Numbering:
     """Frames with the same numbers belong together if the footage has all of the result's; else first goes on first."""
     said = reconstruction.options.get("first_number")
     own = None if said is None else typed(int, said, "options.first_number")
-    first, kept = own or 0, None if own is None else 0
     if footage is None:
-        return Numbering(first, first, 0, kept)
-    numbers = sequence_of(footage)
+        return of_source(own)
+    first, numbers = own or 0, sequence_of(footage)
     if numbers is None:  # it counts from 0
-        return Numbering(first, 0, -first, kept)
+        return Numbering(first, 0, -first, None if own is None else 0)
     indices = {frame.index for frame in reconstruction.frames}
     same = own is not None and indices.issubset(numbers)
     shift = 0 if same else numbers[0] - first

@@ -16,13 +16,14 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.export.moving import MovingNull, moving_nulls
+from factorsfm.export.nulls import Null, moving_nulls, point_nulls
 from factorsfm.export.options import ExportOptions, UpAxis
-from factorsfm.export.other_footage import Numbering, at_size_of, match_numbers
+from factorsfm.export.other_footage import Numbering, at_size_of, match_numbers, of_source
 from factorsfm.frames.fields import Fields
 from factorsfm.result.image_sources import fields_of
 from factorsfm.result.other_world import in_other_world
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
+from factorsfm.result.supervised import named_points
 from factorsfm.support.similarity import Similarity
 
 _TURNED_WORLD = {  # exported world from the reconstruction's
@@ -174,9 +175,10 @@ class Shot:
         return np.asarray(self.world_from_opencv @ _FILM_CAMERA, dtype=np.float64)
 
     @cached_property
-    def objects(self) -> list[MovingNull]:
-        """What moves by itself."""
-        return moving_nulls(self.reconstruction.objects, self.first_frame)
+    def nulls(self) -> list[Null]:
+        """What moves by itself, and the named points."""
+        objects = moving_nulls(self.reconstruction.objects, self.first_frame)
+        return objects + point_nulls(named_points(self.reconstruction), self.numbers[0])
 
     @cached_property
     def lens(self) -> Lens:
@@ -271,6 +273,15 @@ def _first_frame(options: ExportOptions, defaults: Defaults, numbering: Numberin
     if defaults.numbered and numbering.timeline is not None:
         return numbering.timeline
     return defaults.first_frame + numbering.shift - numbering.footage_first
+
+
+def first_frame_of(first_number: int | None, first_frame: int | None, defaults: Defaults) -> int:
+    """What an export adds to the index of a frame in its source.
+
+    Args:
+        first_number: of a source that is a numbered sequence; first_frame: see `ExportOptions`.
+    """
+    return _first_frame(ExportOptions(first_frame=first_frame), defaults, of_source(first_number))
 
 
 def _source_fps(frames: list[FrameResult]) -> float | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +27,7 @@ _NUKE_COLUMNS = (
     *(f"2 1 0 key_{area}_{side} key_{area}_{side} 1" for area in ("search", "track") for side in "xyrt"),
     *(f"2 1 0 key_centre_offset_{side} key_centre_offset_{side} 1" for side in "xy"),
 )  # fmt: skip
+_NOT_IN_NUKE = re.compile(r'["\\\[\]{}$]')  # signs that mean something in a text of its scripts
 _PATTERN, _SEARCH = "-12 -12 12 12", "-24 -24 24 24"  # areas of a track around its place, pixels
 
 _BLENDER = """
@@ -64,7 +66,7 @@ class Track:
     """A track in the registered frames.
 
     Attributes:
-        name: "track_" and the row of its point, counted from 1 as in COLMAP's model.
+        name: see `Reconstruction.track_names`.
         numbers: (k,) of the frames in the timeline, ascending.
         xy, undistorted: (k, 2) pixels from the top left corner of the image, on the footage, and on footage without
             distortion through the same pinhole.
@@ -94,9 +96,10 @@ def tracks_of(shot: Shot) -> Iterator[Track]:
     if not len(rows):
         return
     points, starts = np.unique(result.observation_point[rows], return_index=True)
+    names = result.track_names()
     for point, mine in zip(points.tolist(), np.split(rows, starts[1:]), strict=True):
         numbers = number[result.observation_frame[mine]]
-        yield Track(f"track_{point + 1:05d}", numbers, xy[mine], flat[mine], result.observation_error[mine])
+        yield Track(names[point], numbers, xy[mine], flat[mine], result.observation_error[mine])
 
 
 def _undistorted(camera: pycolmap.Camera, xy: Array) -> Array:
@@ -127,7 +130,7 @@ def write_3de_tracks(shot: Shot, path: Path) -> None:
         lines += [track.name, "0", str(len(track.numbers))]
         for number, (x, y) in zip(track.numbers.tolist(), track.xy.tolist(), strict=True):
             lines.append(f"{number} {x:.6f} {height - y:.6f}")
-    path.write_text("\n".join(lines) + "\n", encoding="ascii")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def write_nuke_tracks(shot: Shot, path: Path) -> None:
@@ -142,7 +145,7 @@ def write_nuke_tracks(shot: Shot, path: Path) -> None:
     path.write_text(
         f"Tracker4 {{\n inputs 0\n tracks {{ {{ 1 {len(_NUKE_COLUMNS)} {len(tracks)} }}\n{{ {columns}\n}}\n"
         f"{{\n{rows}\n}}\n}}\n name Tracks\n}}\n",
-        encoding="ascii",
+        encoding="utf-8",
     )
 
 
@@ -153,10 +156,11 @@ def _nuke_row(track: Track, height: int) -> str:
         " ".join(["curve", *(f"x{number} {value:.6f}" for number, value in zip(numbers, values, strict=True))])
         for values in (track.undistorted[:, 0].tolist(), (height - track.undistorted[:, 1]).tolist())
     ]
+    name = _NOT_IN_NUKE.sub("_", track.name)
     enabled, still = f"{{curve K x{first} 1 x{last + 1} 0}}", f"{{curve K x{first} 0}}"
     empty = " ".join(["{}"] * 11)
     return (
-        f'{{ {enabled} "{track.name}" {{{curves[0]}}} {{{curves[1]}}} {still} {still} 1 0 0 {{curve x{first} 0}} 1 0 '
+        f'{{ {enabled} "{name}" {{{curves[0]}}} {{{curves[1]}}} {still} {still} 1 0 0 {{curve x{first} 0}} 1 0 '
         f"{_PATTERN} {_SEARCH} {empty} }}"
     )
 

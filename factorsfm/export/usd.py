@@ -63,11 +63,12 @@ def write_usd(shot: Shot, path: Path) -> None:
         transform.Set(gf.Matrix4d(matrix.T.tolist()), number)
 
     _write_points(stage, POINTS, shot.reconstruction.points, shot.reconstruction.colors, shot.point_size)
-    for thing in shot.objects:
+    for thing in shot.nulls:
         null = geom.Xform.Define(stage, f"/factorsfm/{thing.name}").AddTransformOp()
         for number, matrix in zip(thing.numbers, thing.world_from_object, strict=True):
             null.Set(gf.Matrix4d(matrix.T.tolist()), number)
-        _write_points(stage, f"/factorsfm/{thing.name}/points", thing.points, thing.colors, shot.point_size)
+        if len(thing.points):
+            _write_points(stage, f"/factorsfm/{thing.name}/points", thing.points, thing.colors, shot.point_size)
     with failures_as_os_errors():
         stage.Save()
 

@@ -45,3 +45,9 @@ def range_text(frames: slice) -> str:
     """The range in the form that `parse_range` reads."""
     start, stop = ("" if part is None else str(part) for part in (frames.start, frames.stop))
     return f"{start}:{stop}" + ("" if frames.step is None else f":{frames.step}")
+
+
+def in_range(number: int, frames: slice) -> bool:
+    """Whether a frame with this number is in a checked range."""
+    start, stop, step = frames.start, frames.stop, frames.step
+    return bool(start <= number and (stop is None or number < stop) and (number - start) % step == 0)

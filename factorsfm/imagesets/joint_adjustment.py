@@ -125,6 +125,7 @@ def _put_together(
         noise=None,
         rolled=None,
         notes=list(base.notes),
+        measured=None,  # it has no tracks in the new images
     )
     result.observation_error = _errors(result)
     centers = result.camera_centers()

@@ -35,6 +35,7 @@ from factorsfm.polish.start import Core, PolishStart, polish_start
 from factorsfm.support.errors import ReconstructionError
 from factorsfm.support.options import Options, PolishOptions
 from factorsfm.support.status import ShotKind
+from factorsfm.tracks.supervised import SupervisedTracks
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -59,6 +60,7 @@ def polish(
     first_focal: tuple[Array, float] | None = None,
     recording: Recording | None = None,
     suspects: Index | None = None,
+    supervised: SupervisedTracks | None = None,
     *,
     in_time: bool = False,
 ) -> Polished:
@@ -74,6 +76,7 @@ def polish(
         recording: of which the images are all, if their rows may have been read one after another; None: all at once,
             or in no order of time.
         suspects: ids (ascending) of tracks that count only where they agree with the others.
+        supervised: tracks of which the errors are known, and that take part however well they fit.
         in_time: whether the images were recorded one after another, so that a lens may have zoomed over them.
         control: known poses, points and lengths; it takes part at the end, and only where the camera moves.
         factors: of the caller, where there is no control; they take part as it does.
@@ -83,7 +86,9 @@ def polish(
         ReconstructionError: hardly any tracks are left that connect frames, or the control does not determine where its
             world is.
     """
-    shot = Shot.of(images, map_points, focal, shape, groups, first_focal, recording, suspects, in_time=in_time)
+    shot = Shot.of(
+        images, map_points, focal, shape, groups, first_focal, recording, suspects, supervised, in_time=in_time
+    )
     named = _named(shot, control, factors, options.polish.max_frames // 2)
     start, frames, left_out = _start(shot, options, named, progress)
     progress("polish: all tracks")
@@ -208,7 +213,7 @@ def _problem(
     moves, state = start.core.motion.kind is ShotKind.GENERAL, start.state.seen_from(0)
     scale, wide, errors = start.sigma, float(np.sqrt(start.inflation)), None
     if options.observation_sigmas is None:
-        state, errors = _with_track_errors(state, start, moves, options)
+        state, errors = _with_track_errors(state, start, shot.supervised.sigma_of(start.tracks), moves, options)
         scale = errors.sigma
     # Correlated errors, from frame to frame and among neighbours, weigh less; the kernel keeps its width in pixels. The
     # persistent part of a track is counted twice by that: correlations among neighbours last longer than a stretch.
@@ -224,15 +229,15 @@ def _problem(
 
 
 def _with_track_errors(
-    state: State, start: PolishStart, moves: bool, options: PolishOptions
+    state: State, start: PolishStart, known_sigma: Array, moves: bool, options: PolishOptions
 ) -> tuple[State, TrackErrors]:
-    """The state on the tracks alone, and the model of their errors, measured on these residuals."""
+    """The state on the tracks alone, and the model of their errors, measured on these residuals where unknown."""
     adjustment = BundleAdjustment(
         state, start.observations, options, ErrorModel(start.sigma), free=Free(translation=moves)
     )
     adjustment.solve(_FIRST_ITERATIONS)
     return adjustment.state, measure_track_errors(
-        adjustment.reprojection_vectors(), start.observations, options.kernel
+        adjustment.reprojection_vectors(), start.observations, options.kernel, known_sigma
     )  # fmt: skip
 
 

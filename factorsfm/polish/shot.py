@@ -15,6 +15,7 @@ from factorsfm.lens.lens import Lens
 from factorsfm.lens.rolling_shutter import Recording, with_sweep
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.tracks.image_tracks import ImageTracks, seen_by
+from factorsfm.tracks.supervised import SupervisedTracks
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -32,6 +33,7 @@ class Shot:
         first_focal: see `estimate_lens`.
         recording: of which the images are all, None if their rows were all read at once.
         suspects: ids (ascending) of the tracks that take part only where they agree with the others.
+        supervised: tracks that take part whatever the others say.
         in_time: whether the images were recorded one after another.
     """
 
@@ -42,6 +44,7 @@ class Shot:
     first_focal: tuple[Array, float] | None
     recording: Recording | None
     suspects: Index
+    supervised: SupervisedTracks
     in_time: bool
 
     @classmethod
@@ -55,6 +58,7 @@ class Shot:
         first_focal: tuple[Array, float] | None,
         recording: Recording | None,
         suspects: Index | None,
+        supervised: SupervisedTracks | None,
         *,
         in_time: bool,
     ) -> Shot:
@@ -65,7 +69,8 @@ class Shot:
             images = [replace(image, tracks=_distorted(image.tracks)) for image in images]
         group = np.zeros(len(images), np.int64) if groups is None else groups
         suspects = np.zeros(0, np.int64) if suspects is None else suspects
-        return cls(images, map_points, guess, group, first_focal, recording, suspects, in_time)
+        supervised = supervised or SupervisedTracks.none()
+        return cls(images, map_points, guess, group, first_focal, recording, suspects, supervised, in_time)
 
     @property
     def registered(self) -> list[int]:
@@ -77,12 +82,13 @@ class Shot:
         return [self.images[position].tracks for position in frames]
 
     def long_tracks(self, frames: Sequence[int], least: int) -> Index:
-        """Ids (ascending) of the tracks that at least so many of the images see."""
-        return seen_by(self.tracks(frames), least)
+        """Ids (ascending) of the tracks that at least so many of the images see; of the supervised ones, two."""
+        tracks = self.tracks(frames)
+        return np.union1d(seen_by(tracks, least), np.intersect1d(seen_by(tracks, 2), self.supervised.ids))
 
     def trusted(self, tracks: Index) -> Index:
-        """Rows of the tracks that are not suspected."""
-        return np.flatnonzero(~np.isin(tracks, self.suspects))
+        """Rows of the tracks on which the cameras are solved first: neither suspected nor supervised."""
+        return np.flatnonzero(~np.isin(tracks, np.r_[self.suspects, self.supervised.ids]))
 
     def observations(self, frames: Sequence[int], tracks: Index) -> Observations:
         """Of some tracks (ascending ids) in some images."""

@@ -103,9 +103,7 @@ def polish_start(
 
     progress("polish: points")
     part = core.adjustment.state if general else core.motion.rotation_only
-    state, observations, tracks, moving = _with_fitting_tracks(
-        part, core, observations, tracks, shot.suspects, options.polish
-    )
+    state, observations, tracks, moving = _with_fitting_tracks(part, core, observations, tracks, shot, options.polish)
     return PolishStart(state, observations, tracks, core.adjustment.sigma, inflation, depths, core, moving)
 
 
@@ -229,9 +227,10 @@ def _estimate_lens(
 
 
 def _with_fitting_tracks(
-    part: State, core: Core, observations: Observations, tracks: Index, suspects: Index, options: PolishOptions
+    part: State, core: Core, observations: Observations, tracks: Index, shot: Shot, options: PolishOptions
 ) -> tuple[State, Observations, Index, Index]:
-    """All points for the cameras of `part`, and the tracks that fit them; of the suspects those that agree.
+    """All points for the cameras of `part`, and the tracks that fit them; of the suspects those that agree, and all
+    that are supervised.
 
     The last of the result are the tracks that move by themselves.
     """
@@ -246,26 +245,34 @@ def _with_fitting_tracks(
         state, observations, replace(options, iterations=4), solved.errors, free=Free(cameras=False)
     )
     state, errors = adjustment.solve(), adjustment.reprojection_errors()
-    agree = agreeing(observations, errors, np.isin(tracks, suspects))
+    agree = agreeing(observations, errors, np.isin(tracks, shot.suspects))
     left_out = np.union1d(left_out, np.flatnonzero(~agree))
-    moves = moving_together(observations, errors, solved.sigma, rests_on=points, left_out=left_out)
+    supervised = np.isin(tracks, shot.supervised.ids)
+    judged, moves = np.flatnonzero(~supervised), np.zeros(len(tracks), bool)
+    moves[judged] = moving_together(
+        observations.of(judged), errors[~supervised[observations.point]], solved.sigma,
+        rests_on=np.searchsorted(judged, points), left_out=np.searchsorted(judged, left_out),
+    )  # fmt: skip
     scene, moving = agree & ~moves, tracks[moves]
     if not scene.all():
         kept = np.flatnonzero(scene)
         state, tracks, errors = state.of(kept), tracks[kept], errors[scene[observations.point]]
+        supervised = supervised[kept]
         observations = observations.of(kept)
     if options.observation_sigmas is None:
-        kept = _usual_points(observations, errors, options)
+        kept = np.flatnonzero(_usual_points(observations, errors, ~supervised, options) | supervised)
         return state.of(kept), observations.of(kept), tracks[kept], moving
     observations, kept = _only(observations, errors < options.observation_sigmas * solved.sigma)
     return state.of(kept), observations, tracks[kept], moving
 
 
-def _usual_points(observations: Observations, errors: Array, options: PolishOptions) -> Index:
-    """Points whose typical error is not far outside the usual (log scale, robust)."""
+def _usual_points(
+    observations: Observations, errors: Array, among: NDArray[np.bool_], options: PolishOptions
+) -> NDArray[np.bool_]:
+    """(n,) whether the typical error of a point is not far outside what is usual among some (log scale, robust)."""
     typical = log_errors(observations, errors)
-    center, spread = center_and_spread(typical)
-    return np.nonzero(typical < center + options.outlier_sigmas * max(spread, 0.1))[0]
+    center, spread = center_and_spread(typical[among])
+    return np.asarray(typical < center + options.outlier_sigmas * max(spread, 0.1))
 
 
 def _only(observations: Observations, good: NDArray[np.bool_]) -> tuple[Observations, Index]:

@@ -11,6 +11,7 @@ const roundLength = most => [5, 2, 1].map(f => f * 10 ** Math.floor(Math.log10(m
 const frameCount = data.frame.length, last = Math.max(frameCount - 1, 1);
 const solved = Boolean(data.positions && data.positions.length);
 const hasTracks = solved && data.tracks.start[frameCount] > 0;
+const alignable = hasTracks && data.survey !== "world";
 const hasThumbnails = data.thumbnail.some(Boolean);
 
 // The frame that is shown, and who follows it.
@@ -39,6 +40,23 @@ function coalesced(draw) {
     pending = true;
     requestAnimationFrame(() => { pending = false; draw(); });
   };
+}
+
+// ---- commands that the page writes ------------------------------------------------------------------------
+
+const onWindows = /^\/[A-Za-z]:\//.test(location.pathname);
+
+// The folder in which the page lies.
+function resultFolder() {
+  if (location.protocol !== "file:") return "RESULT";
+  const folder = decodeURIComponent(location.pathname).replace(/\/[^/]*$/, "");
+  return onWindows ? folder.slice(1).replaceAll("/", "\\") : folder;
+}
+
+// A word of a command as the shell takes it.
+function shellWord(word) {
+  if (/^[\w@%+=:,./-]+$/.test(word)) return word;
+  return onWindows ? `"${word}"` : `'${word.replaceAll("'", "'\\''")}'`;
 }
 
 // ---- points, cameras and tracks -------------------------------------------------------------------------

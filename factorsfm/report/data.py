@@ -10,8 +10,10 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from factorsfm.alignment.align import survey
 from factorsfm.report.charts import charts
-from factorsfm.report.geometry import Tracks, median_prior_residuals, scene, tracks
+from factorsfm.report.geometry import Scene, Tracks, median_prior_residuals, scene, tracks
+from factorsfm.report.listed_tracks import ListedTracks, listed_tracks
 from factorsfm.report.props import place_props
 from factorsfm.report.wording import status_words
 from factorsfm.result.moving import Moving
@@ -27,7 +29,8 @@ _NONE = -(2**15)
 
 def reconstruction_data(reconstruction: Reconstruction) -> dict[str, Any]:
     """All data for the report of a reconstruction."""
-    view = scene(reconstruction, _MAX_POINTS)
+    listed = listed_tracks(reconstruction)
+    view = scene(reconstruction, _MAX_POINTS, listed.point)
     camera = reconstruction.camera
     unit = "m" if reconstruction.metric else "units"
     return {
@@ -35,6 +38,8 @@ def reconstruction_data(reconstruction: Reconstruction) -> dict[str, Any]:
         "unit": unit,
         "width": camera.width,
         "height": camera.height,
+        "sizes": [(lens.width, lens.height) for lens in map(reconstruction.camera_of, reconstruction.frames)],
+        "survey": survey(reconstruction),
         "focals": [reconstruction.camera_of(frame).focal_length_x for frame in reconstruction.registered],
         "points": _base64(view.points, "<f4"),
         "colors": _base64(view.colors, "u1"),
@@ -42,9 +47,10 @@ def reconstruction_data(reconstruction: Reconstruction) -> dict[str, Any]:
         "rotations": _base64(view.rotations, "<f4"),
         "positions": view.positions,
         "tracks": _tracks_data(
-            tracks(reconstruction, view, _MAX_OBSERVATIONS),
+            tracks(reconstruction, view, _MAX_OBSERVATIONS, listed.point),
             [reconstruction.camera_of(f) for f in reconstruction.frames],
         ),
+        "listed": _listed_data(listed, reconstruction, view),
         "ground": _ground(reconstruction),
         "moving": None if reconstruction.moving is None else _moving_data(reconstruction.moving, reconstruction),
     }
@@ -91,6 +97,17 @@ def _tracks_data(found: Tracks, cameras: Sequence[pycolmap.Camera]) -> dict[str,
         "residual_steps": _RESIDUAL_STEPS,
         "prior": _base64(_steps(found.prior_residual, _PRIOR_STEPS), "<i2"),
         "prior_steps": _PRIOR_STEPS,
+    }
+
+
+def _listed_data(listed: ListedTracks, reconstruction: Reconstruction, view: Scene) -> dict[str, Any]:
+    """The listed tracks; `point`: rows in the scene."""
+    names = reconstruction.track_names()
+    return {
+        "number": reconstruction.track_ids[listed.point] + 1,
+        "name": [names[row] for row in listed.point.tolist()],
+        "point": np.searchsorted(view.rows, listed.point),
+        **{name: getattr(listed, name) for name in ("error", "worst", "first", "last", "frames", "supervised")},
     }
 
 

@@ -66,10 +66,15 @@ function drawMoving(prepared, position) {
 function drawFootage() {
   const prepared = prepare(byId("footage"));
   if (!prepared) return;
-  const {context, width, height, ratio} = prepared, position = seek.position;
+  const position = seek.position;
   drawPicture(prepared, position, 1);
   if (moving && byId("show_moving").checked) drawMoving(prepared, position);
-  if (!hasTracks) return;
+  if (hasTracks) drawTracks(prepared, position);
+  drawPicks(prepared, position);
+}
+
+function drawTracks(prepared, position) {
+  const {context, width, height, ratio} = prepared;
   const x = o => tracks.place[2 * o] / 65535 * width, y = o => tracks.place[2 * o + 1] / 65535 * height;
   if (byId("show_tracks").checked) drawTails(prepared, position, tracks.start, tracks.point, tracks.place, "#ffffffb0");
   const pixel = magnified * width / data.width / data.tracks.residual_steps, side = 3 * ratio;
@@ -84,6 +89,7 @@ function drawFootage() {
     context.lineTo(x(o) + pixel * tracks.residual[2 * o], y(o) + pixel * tracks.residual[2 * o + 1]);
     context.stroke();
   }
+  drawPointed(prepared, position);
 }
 
 // ---- depth -----------------------------------------------------------------------------------------------
@@ -193,13 +199,13 @@ function drawStrip() {
   }
 }
 
-const drawFootageAll = () => { drawFootage(); drawDepths(); drawStrip(); };
+const drawFootageAll = () => { drawFootage(); drawPointedAlone(); drawDepths(); drawStrip(); };
 const drawFootageCoalesced = coalesced(drawFootageAll);
 function drawFootageLater() { drawFootageCoalesced(); }
 
 function startFootage() {
   const aspect = data.width ? `${data.width} / ${data.height}` : "16 / 9";
-  for (const id of ["footage", "solved_depth", "prior_depth", "depth_scatter"]) byId(id).style.aspectRatio = aspect;
+  for (const id of ["footage", "pointed", "solved_depth", "prior_depth", "depth_scatter"]) byId(id).style.aspectRatio = aspect;
   byId("residuals_label").textContent = `residuals, ${magnified} times longer`;
   for (const id of ["show_tracks", "show_residuals", "show_moving"]) byId(id).addEventListener("change", drawFootageLater);
   const strip = byId("strip");

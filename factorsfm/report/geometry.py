@@ -50,12 +50,19 @@ class Tracks:
     prior_residual: NDArray[np.float64]
 
 
-def scene(reconstruction: Reconstruction, max_points: int) -> Scene:
-    """The scene with at most `max_points` points, an even choice of them; points at infinity are left out."""
+_NONE = np.zeros(0, np.int64)
+
+
+def scene(reconstruction: Reconstruction, max_points: int, listed: NDArray[np.int64] = _NONE) -> Scene:
+    """The scene with at most `max_points` points, an even choice of them; points at infinity are left out.
+
+    Args:
+        listed: rows of points that are there beside the others.
+    """
     posed = [(k, f.cam_from_world) for k, f in enumerate(reconstruction.frames) if f.cam_from_world is not None]
     world_from_cam = np.array([pose.inverse().matrix() for _, pose in posed]).reshape(-1, 3, 4)
     rows = np.flatnonzero(np.isfinite(reconstruction.points).all(axis=1))
-    rows = rows[:: max(1, -(-len(rows) // max_points))]
+    rows = np.union1d(rows[:: max(1, -(-len(rows) // max_points))], np.intersect1d(rows, listed))
     origin, axes = np.zeros(3), np.eye(3)
     if posed:
         origin, axes = world_from_cam[0, :, 3], world_from_cam[0, :, :3]
@@ -69,11 +76,20 @@ def scene(reconstruction: Reconstruction, max_points: int) -> Scene:
     )
 
 
-def tracks(reconstruction: Reconstruction, view: Scene, max_observations: int) -> Tracks:
-    """The tracks of the scene's points, of an even choice of the points where there are too many observations."""
-    step = max(1, -(-len(reconstruction.observation_point) // max_observations))
+def tracks(
+    reconstruction: Reconstruction, view: Scene, max_observations: int, listed: NDArray[np.int64] = _NONE
+) -> Tracks:
+    """The tracks of the scene's points, of an even choice of the points where there are too many observations.
+
+    Args:
+        listed: rows of points in the reconstruction whose tracks are there in any case.
+    """
+    in_list = int(np.isin(reconstruction.observation_point, listed).sum())
+    rest = max(max_observations - in_list, max_observations // 4)
+    step = max(1, -(-(len(reconstruction.observation_point) - in_list) // rest))
     row_in_scene = np.full(len(reconstruction.points), -1)
-    row_in_scene[view.rows[::step]] = np.arange(0, len(view.rows), step)
+    shown = np.flatnonzero((np.arange(len(view.rows)) % step == 0) | np.isin(view.rows, listed))
+    row_in_scene[view.rows[shown]] = shown
     registered = np.array([frame.registered for frame in reconstruction.frames], bool)
     point = row_in_scene[reconstruction.observation_point]
     kept = np.flatnonzero((point >= 0) & registered[reconstruction.observation_frame])

@@ -29,16 +29,19 @@ function drawAll() {
 
 byId("scene_card").hidden = byId("scene_hint").hidden = !solved;
 byId("footage_card").hidden = !hasThumbnails && !hasTracks;
-byId("tracks_controls").hidden = !hasTracks;
+byId("tracks_controls").hidden = byId("tracks_section").hidden = !hasTracks;
 byId("moving_control").hidden = !moving;
 if (!solved) byId("footage_title").textContent = "Footage";
 byId("depth_section").hidden = withPrior.every(position => position < 0);
 byId("charts_section").hidden = !charts.length;
+byId("align_section").hidden = !alignable;
 byId("footage_section").hidden = !frameCount;
 if (frameCount) {
   slider.max = frameCount - 1;
   startFootage();
   if (solved) startScene();
+  if (alignable) startAligning();
+  if (hasTracks) startList();
   startCharts();
   seek.followers.push(showStatus);
   slider.addEventListener("input", () => goTo(Number(slider.value)));

@@ -11,7 +11,7 @@ from string import Template
 from typing import Any
 
 from factorsfm.report.data import frames_data, reconstruction_data
-from factorsfm.report.document import document, packaged
+from factorsfm.report.document import document, packaged, script_text
 from factorsfm.report.wording import (
     explanation,
     failure_sentence,
@@ -21,15 +21,18 @@ from factorsfm.report.wording import (
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.result.summary import focal_range, with_total
 from factorsfm.result.verdict import Grade, verdict_of
-from factorsfm.support.json_text import json_text
 from factorsfm.support.program import PROGRAM, program_version
 
-_SCRIPTS = ("base.js", "view.js", "footage.js", "charts.js", "page.js")
+_SCRIPTS = ("base.js", "view.js", "footage.js", "align.js", "tracks.js", "charts.js", "page.js")
 _LIBRARIES = ("gtsam", "pycolmap", "opencv-python-headless", "onnxruntime", "numpy")
 
 
-def report_html(reconstruction: Reconstruction) -> str:
-    """The report as one HTML document that contains all styles, scripts and data."""
+def report_html(reconstruction: Reconstruction, folder: str | None = None) -> str:
+    """The report as one HTML document that contains all styles, scripts and data.
+
+    Args:
+        folder: of the result, as the user calls it, where the shot can be solved again from it.
+    """
     return _document(
         grade=verdict_of(reconstruction).grade,
         verdict=verdict_sentence(reconstruction),
@@ -39,7 +42,7 @@ def report_html(reconstruction: Reconstruction) -> str:
         frames=reconstruction.frames,
         seconds=reconstruction.seconds,
         options=reconstruction.options,
-        data=reconstruction_data(reconstruction),
+        data={**reconstruction_data(reconstruction), "folder": folder},
     )
 
 
@@ -81,15 +84,16 @@ def _document(
         explanation=escape(explanation),
         notes="".join(f"<li>{escape(note)}</li>" for note in notes),
         facts="".join(f"<div><dt>{key}</dt><dd>{escape(str(value))}</dd></div>" for key, value in facts.items()),
+        align=packaged("factorsfm.report", "align.html"),
         statuses=_statuses(frames),
         timings=_table({stage: f"{value:.2f} s" for stage, value in with_total(seconds).items()}),
         versions=_table(_versions()),
         options=_table(_flat(options)),
-        # the browser takes "</" for the end of the script element
-        data=json_text(data, indent=None).replace("</", "<\\/"),
+        data=script_text(data),
         script="".join(packaged("factorsfm.report", name) for name in _SCRIPTS),
     )
-    return document(f"{source} – {PROGRAM} report" if source else f"{PROGRAM} report", body, scripted=True)
+    title = f"{source} – {PROGRAM} report" if source else f"{PROGRAM} report"
+    return document(title, body, styles=packaged("factorsfm.report", "align.css"), scripted=True)
 
 
 def _facts(reconstruction: Reconstruction) -> dict[str, Any]:

@@ -19,21 +19,25 @@ from factorsfm.result.moving import moving_json
 from factorsfm.result.objects import objects_json
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.result.summary import failure_summary, incomplete_summary, part_name, summary
+from factorsfm.result.tracks_file import write_tracks
 from factorsfm.support.errors import InputError
 from factorsfm.support.json_reading import read_json
 from factorsfm.support.json_text import json_text
 from factorsfm.support.program import PROGRAM
 
-# Whatever an earlier result may have left besides summary.json; picture.png is drawn by the demo.
-_ENTRIES = ("trajectory.tum", "colmap", "points.ply", "objects.json", "moving.json", "report.html", "picture.png")
+# Whatever an earlier result may have left besides summary.json; picture.png is drawn by the demo, view.html by `view`.
+_ENTRIES = (
+    "trajectory.tum", "colmap", "points.ply", "objects.json", "moving.json", "tracks.npz", "report.html",
+    "view.html", "picture.png",
+)  # fmt: skip
 _SUMMARY = "summary.json"
 _PARTS = "part-[0-9][0-9][0-9]*"  # folders of the other parts of an image set
 _REPLACING = f".{PROGRAM}-replacing-"  # begins the name of the folder in which a result waits that replaces another
 
 
 def write_folder(reconstruction: Reconstruction, directory: str | Path) -> None:
-    """Write trajectory.tum, colmap/, points.ply, summary.json, report.html; objects.json where there are objects, and
-    moving.json where something moves by itself.
+    """Write trajectory.tum, colmap/, points.ply, summary.json, report.html; objects.json where there are objects,
+    moving.json where something moves by itself, and of a video tracks.npz.
 
     All of them or nothing.
 
@@ -45,13 +49,14 @@ def write_folder(reconstruction: Reconstruction, directory: str | Path) -> None:
         InputError: the directory cannot be written, or holds something else than an earlier result.
     """
     with _complete_or_nothing(Path(directory)) as folder:
-        _write_files(reconstruction, folder)
+        _write_files(reconstruction, folder, directory)
         for number, other in enumerate(reconstruction.others, 2):
             (folder / part_name(number)).mkdir()
-            _write_files(other, folder / part_name(number))
+            _write_files(other, folder / part_name(number), Path(directory) / part_name(number))
 
 
-def _write_files(reconstruction: Reconstruction, folder: Path) -> None:
+def _write_files(reconstruction: Reconstruction, folder: Path, place: str | Path) -> None:
+    """`place`: where the folder comes to lie."""
     write_trajectory(reconstruction, folder / "trajectory.tum")
     write_colmap(reconstruction, folder / "colmap")
     write_ply(reconstruction, folder / "points.ply")
@@ -61,7 +66,10 @@ def _write_files(reconstruction: Reconstruction, folder: Path) -> None:
     if reconstruction.moving is not None:
         content = json_text(moving_json(reconstruction.moving), indent=None)
         (folder / "moving.json").write_text(content, encoding="utf-8")
-    (folder / "report.html").write_text(report_html(reconstruction), encoding="utf-8")
+    if reconstruction.measured is not None:
+        write_tracks(reconstruction.measured, folder / "tracks.npz")
+    again = None if reconstruction.measured is None else str(place)
+    (folder / "report.html").write_text(report_html(reconstruction, again), encoding="utf-8")
     (folder / _SUMMARY).write_text(json_text(summary(reconstruction)), encoding="utf-8")
 
 
@@ -201,6 +209,18 @@ def is_earlier_result(directory: Path) -> bool:
     except InputError:
         return False
     return isinstance(content, dict) and content.get("program") == PROGRAM
+
+
+def report_of(directory: Path) -> Path:
+    """The report in a result folder, absolute.
+
+    Raises:
+        InputError: the folder holds no result, or one that is incomplete.
+    """
+    page = directory.absolute() / "report.html"
+    if not (is_earlier_result(directory) and page.is_file()):
+        raise InputError(f"{directory} holds no report of factorsfm; a folder that it has written is expected")
+    return page
 
 
 def _unwritable(directory: Path, error: OSError) -> InputError:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import logging
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from factorsfm.export.footage import frames_of
 from factorsfm.export.options import ExportOptions
 from factorsfm.export.shot import Defaults, make_shot
+from factorsfm.report.document import data_of
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.support.context import Closing
 from factorsfm.support.errors import InputError
@@ -36,8 +38,8 @@ class Thumbnails(Closing):
         1
     """
 
-    def __init__(self, most: int = _MOST) -> None:
-        self._most = most
+    def __init__(self, most: int = _MOST, width: int = _WIDTH) -> None:
+        self._most, self._width = most, width
         self._kept: dict[int, Future[bytes]] = {}
         self._worker = ThreadPoolExecutor(1, "factorsfm-thumbnails")  # nobody waits for a picture
         self._added = 0
@@ -46,8 +48,8 @@ class Thumbnails(Closing):
     def add(self, image: NDArray[np.uint8]) -> None:
         """Add the next frame, (h, w, 3) BGR or (h, w) grey."""
         if self._added % self._step == 0:
-            small = _halved(image) if _is_large(image) else image.copy()  # of a large image no copy waits
-            self._kept[self._added] = self._worker.submit(thumbnail, small)
+            small = _halved(image) if _is_large(image, self._width) else image.copy()  # of a large image no copy waits
+            self._kept[self._added] = self._worker.submit(thumbnail, small, self._width)
         self._added += 1
         if len(self._kept) > self._most:
             self._step *= 2
@@ -80,19 +82,19 @@ class Thumbnails(Closing):
             frame.thumbnail = jpeg
 
 
-def thumbnail(image: NDArray[np.uint8]) -> bytes:
-    """A JPEG at most 384 pixels wide; large images are halved first, which is fast."""
-    while _is_large(image):
+def thumbnail(image: NDArray[np.uint8], width: int = _WIDTH) -> bytes:
+    """A JPEG at most so wide; large images are halved first, which is fast."""
+    while _is_large(image, width):
         image = _halved(image)
-    if image.shape[1] > _WIDTH:
-        size = _WIDTH, max(1, round(image.shape[0] * _WIDTH / image.shape[1]))
+    if image.shape[1] > width:
+        size = width, max(1, round(image.shape[0] * width / image.shape[1]))
         image = np.asarray(cv2.resize(image, size), np.uint8)
     _, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
     return jpeg.tobytes()
 
 
-def _is_large(image: NDArray[np.uint8]) -> bool:
-    return bool(image.shape[1] >= 2 * _WIDTH)
+def _is_large(image: NDArray[np.uint8], width: int) -> bool:
+    return bool(image.shape[1] >= 2 * width)
 
 
 def _halved(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -107,16 +109,38 @@ def _done(jpeg: bytes) -> Future[bytes]:
     return done
 
 
-def retake(result: Reconstruction, footage: Path | None = None) -> None:
-    """Give a result that was read back its thumbnails, if its footage is at hand; see `ExportOptions.footage`."""
+def take_from_report(result: Reconstruction, report: Path) -> None:
+    """Give a result that was read back the thumbnails of its report, as far as there are some."""
+    try:
+        content = data_of(report.read_text(encoding="utf-8"))
+        pictures = dict(zip(content["frame"], content["thumbnail"], strict=True))
+        for frame in result.frames:
+            kept = pictures.get(frame.index)
+            frame.thumbnail = base64.b64decode(kept, validate=True) if kept else None
+    except (OSError, ValueError, LookupError, TypeError) as error:  # a report without pictures is one, too
+        logger.info("no thumbnails: %s", error)
+
+
+def retake(result: Reconstruction, footage: Path | None = None, width: int = _WIDTH) -> None:
+    """Give a result that was read back its thumbnails, if its footage is at hand.
+
+    Args:
+        footage: the shot, see `ExportOptions.footage`; width: of the thumbnails, pixels.
+
+    Raises:
+        InputError: the footage given is not that of the shot.
+    """
     try:
         shot = make_shot(result, ExportOptions(footage=footage), Defaults())
         if shot.footage is None:
             return
-        with Thumbnails() as thumbnails:
+        with Thumbnails(width=width) as thumbnails:
             for image in frames_of(shot, result.frames):
                 thumbnails.add(image.image)
-    except InputError as error:  # a report without pictures is one, too
+    except InputError as error:
+        if footage is not None:
+            raise
+        # a report without pictures is one, too
         logger.info("no thumbnails: %s", error)
         return
     for frame, jpeg in zip(result.frames, thumbnails.by_frame(), strict=True):

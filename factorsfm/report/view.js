@@ -111,11 +111,16 @@ function drawScene() {
   if (!prepared) return;
   const {context, width, height, ratio} = prepared, from = viewer(width, height);
   drawPoints(context, width, height, ratio, from);
-  if (from.inside) return;
   const project = p => {
     const d = [p[0] - from.eye[0], p[1] - from.eye[1], p[2] - from.eye[2]], w = dot(from.axes[2], d);
     return w < from.near ? null : [width / 2 + from.focal * dot(from.axes[0], d) / w, height / 2 + from.focal * dot(from.axes[1], d) / w];
   };
+  if (!from.inside) drawPath(prepared, from, project);
+  drawScenePicks(context, ratio, project);
+}
+
+// The ground, the path, some cameras and a scale bar, as seen from outside.
+function drawPath({context, width, height, ratio}, from, project) {
   const line = (a, b) => { if (a && b) { context.moveTo(...a); context.lineTo(...b); } };
 
   context.strokeStyle = css("--quiet");

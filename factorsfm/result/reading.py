@@ -22,6 +22,7 @@ from factorsfm.result.moving import read_moving
 from factorsfm.result.objects import read_objects
 from factorsfm.result.reconstruction import FrameResult, LensFit, PriorFit, Reconstruction, RollingShutter
 from factorsfm.result.summary import part_name
+from factorsfm.result.tracks_file import read_tracks
 from factorsfm.support.errors import InputError
 from factorsfm.support.file_names import check_name
 from factorsfm.support.json_reading import read_json, typed
@@ -89,9 +90,8 @@ def read_result(directory: str | Path) -> Reconstruction:
     """Read what `Reconstruction.write` has written.
 
     Poses, points, colours and the lens come back exactly, observations to a millionth of a pixel. What the files do
-    not hold is missing: covariances, the observations' noise, the tracks' identities (here: the points' rows), the
-    prior's residuals (NaN), observations in frames that are not registered, and points that fewer than two registered
-    frames see.
+    not hold is missing: covariances, the observations' noise, the prior's residuals (NaN), observations in frames that
+    are not registered, and points that fewer than two registered frames see.
 
     Raises:
         InputError: the folder holds no result, an incomplete or a damaged one, or that of a shot that could not be
@@ -104,6 +104,7 @@ def read_result(directory: str | Path) -> Reconstruction:
         result = _reconstruction(summary, pycolmap.Reconstruction(directory / "colmap"))
         result.objects = read_objects(directory / "objects.json")
         result.moving = read_moving(directory / "moving.json")
+        result.measured = read_tracks(directory / "tracks.npz")
     except (InputError, OSError, ValueError, LookupError, RuntimeError) as error:
         raise InputError(f"the result in {directory} is damaged: {error}") from error
     result.others = [read_result(directory / part_name(number)) for number in range(2, summary.parts + 1)]
@@ -148,7 +149,7 @@ def _reconstruction(summary: _Summary, model: pycolmap.Reconstruction) -> Recons
         frames=frames,
         points=xyz,
         colors=np.array([point.color for point in points], np.uint8).reshape(-1, 3),
-        track_ids=np.arange(len(points)),
+        track_ids=np.array([*row_of_point], np.int64) - 1,
         observation_frame=np.repeat(np.arange(len(frames)), [len(rows) for rows, _ in seen]),
         observation_point=np.concatenate([np.empty(0, np.int64), *(rows for rows, _ in seen)]),
         observation_xy=pixels - PIXEL_CENTER,

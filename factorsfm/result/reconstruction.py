@@ -16,10 +16,12 @@ from factorsfm.control.fit import ControlFit
 from factorsfm.inertial.fit import ImuFit
 from factorsfm.motion.stretches import Stretch
 from factorsfm.objects.object_result import ObjectResult
+from factorsfm.polish.measured import MeasuredShot
 from factorsfm.polish.observability import CameraObservability
 from factorsfm.result.alignment import Alignment
 from factorsfm.result.moving import Moving
 from factorsfm.support.status import FrameStatus, ShotKind
+from factorsfm.tracks.supervised import SupervisedTracks
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,6 +200,7 @@ class Reconstruction:
         seconds: wall time by stage.
         options: all options as plain data.
         others: reconstructions of other parts of an image set that cannot be joined to this one, largest first.
+        measured: of a video, what it was solved from, so that it can be solved again; None if it is not kept.
     """
 
     camera: pycolmap.Camera
@@ -229,11 +232,17 @@ class Reconstruction:
     seconds: dict[str, float] = field(default_factory=dict)
     options: dict[str, Any] = field(default_factory=dict)
     others: list[Reconstruction] = field(default_factory=list)
+    measured: MeasuredShot | None = None
 
     @property
     def registered(self) -> list[FrameResult]:
         """The frames that have a pose."""
         return [frame for frame in self.frames if frame.registered]
+
+    def track_names(self) -> list[str]:
+        """(n,) of the track of each point: that of the user, or "track_" and its number in COLMAP's model."""
+        named = self.measured.supervised if self.measured is not None else SupervisedTracks.none()
+        return named.names_of(self.track_ids)
 
     def camera_of(self, frame: FrameResult) -> pycolmap.Camera:
         """The lens of a frame."""

@@ -13,6 +13,7 @@ import numpy as np
 from factorsfm.camera.files import camera_to_json
 from factorsfm.objects.object_result import ObjectResult
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
+from factorsfm.result.supervised import named_points
 from factorsfm.result.verdict import Grade, median_reprojection_error, verdict_of
 from factorsfm.support.program import PROGRAM, program_version
 from factorsfm.support.status import ShotKind
@@ -43,6 +44,7 @@ def summary(reconstruction: Reconstruction) -> dict[str, Any]:
         "alignment": reconstruction.alignment and asdict(reconstruction.alignment),
         "moving": [asdict(stretch) for stretch in reconstruction.moving.stretches] if reconstruction.moving else [],
         "objects": [_object_json(found) for found in reconstruction.objects],
+        "named_points": [asdict(point) for point in named_points(reconstruction)],
         "reprojection_error": median_reprojection_error(reconstruction),
         "observability": pooled_observability(reconstruction),
         "focal_length": reconstruction.camera.mean_focal_length(),
@@ -75,7 +77,7 @@ def failure_summary(
         "registered": sum(frame.registered for frame in frames),
         **dict.fromkeys(("keyframes", "points", "observations", "parts"), 0),
         **dict.fromkeys((*numbers, "metric", "focal_range", "camera", "lens", "shutter")),
-        **{name: [] for name in ("doubts", "stretches", "moving", "objects", "notes")},
+        **{name: [] for name in ("doubts", "stretches", "moving", "objects", "named_points", "notes")},
         "seconds": with_total(seconds),
         "statuses": [_frame_json(frame) for frame in frames],
         "options": options,

@@ -10,27 +10,27 @@ import pycolmap
 from numpy.typing import NDArray
 
 from factorsfm.camera.guess import first_focal_std
-from factorsfm.control.known import Control, LocatedControl, locate
+from factorsfm.control.known import Control
 from factorsfm.control.with_factors import ShotFactors
+from factorsfm.frames.recorded import RecordedFootage, RecordedFrame
 from factorsfm.graph.added_factors import AddedFactors
 from factorsfm.graph.factors_on_poses import FactorsOnPoses
-from factorsfm.lens.camera_model import distortion_of
-from factorsfm.lens.rolling_shutter import Recording
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.mapping.mapper import Mapper
-from factorsfm.polish.polish import polish
+from factorsfm.mending.joined import joined
+from factorsfm.mending.user_tracks import UserTracks
+from factorsfm.polish.measured import MeasuredShot
 from factorsfm.polish.polished import Polished
 from factorsfm.priors.depth import DepthPrior
-from factorsfm.result.assembly import assemble
 from factorsfm.result.reconstruction import Reconstruction
+from factorsfm.result.solved_shot import solved_shot
 from factorsfm.streaming.frame_update import SeenFrame
 from factorsfm.streaming.imu_result import add_imu
 from factorsfm.streaming.imu_source import FramePoses, ImuSource
-from factorsfm.streaming.lost_frames import lost_frames
-from factorsfm.support.errors import ReconstructionError
 from factorsfm.support.options import Options
 from factorsfm.support.progress import Progress
 from factorsfm.support.stages import StageSeconds
+from factorsfm.tracks.supervised import SupervisedTracks
 
 Array = NDArray[np.float64]
 
@@ -44,10 +44,10 @@ class EndedShot:
         colors: (n, 3) RGB by track id.
         camera: the lens of the mapper's images; lens_given: whether it is known, and no guess.
         depth: the prior; without_depth: why it failed, by the frame's index.
-        control: what is known beforehand; imu: beside the stream.
-        times: (n,) when the frames were recorded, in usual intervals; interval: of these, seconds, 0 if unknown.
+        control: what is known beforehand; imu: beside the stream; footage: how the frames were recorded.
         seconds: of the stages so far; that of the polish is added.
         suspects: ids of the tracks that count only where they agree with the others.
+        tracks: of the user.
     """
 
     frames: Sequence[SeenFrame]
@@ -60,84 +60,54 @@ class EndedShot:
     without_depth: Mapping[int, str]
     control: Control | None
     imu: ImuSource | None
-    times: Array
-    interval: float
+    footage: RecordedFootage
     options: Options
     seconds: StageSeconds
     suspects: NDArray[np.int64]
+    tracks: UserTracks | None
 
     def reconstruction(self, progress: Progress | None) -> Reconstruction:
         """Polish over all frames and tracks; errors as in `Stream.finish`."""
-        control = self._located_control()
-        registered = sum(image.registered for image in self.images)
-        if registered < 2:
-            worst = next((i for i in self.images if not i.registered), self.images[0])
-            raise ReconstructionError(
-                f"{registered} of {len(self.frames)} frames registered, at least 2 needed; "
-                f"frame {self.frames[worst.tracks.position].index}: {worst.message}"
-            )
-        factors = self._factors()
+        measured, factors = self._measured(), self._factors()
         with self.seconds.of("polish"):
-            polished = self._polished(control, factors, progress)
-        result = assemble(
-            polished,
-            self.images,
-            self.frames,
-            self.colors,
-            self.camera,
-            lens_given=self.lens_given,
-            depth_kind=None if self.depth is None else self.depth.kind,
-            seconds=dict(self.seconds),
-            interval=self.interval,
-            options=self.options.to_dict(),
-        )
-        if lost := lost_frames(result.frames, self.images):
-            result.notes.append(lost)
-        if len(self.suspects):
-            agree = int(np.isin(polished.tracks, self.suspects).sum())
-            result.notes.append(
-                f"Tracks that a network takes for what moves: {len(self.suspects)}; {agree} of them agree with the "
-                "scene and take part."
+            polished = measured.solved(
+                lambda stage: progress(stage, 0, None) if progress else None,
+                factors,
+                self._imu_joining if factors is None and self.imu is not None else None,
             )
-        if self.without_depth:
-            count, first = len(self.without_depth), next(iter(self.without_depth.values()))
-            result.notes.append(f"Frames that went without depth because the prior failed: {count}; {first}.")
+        result = solved_shot(measured, polished, self.seconds)
         if self.imu is not None:
             took_part = polished.factors
             on_poses = None if took_part is None else took_part.on_poses(polished.frames, [], [])
             focal_std = 0.0 if polished.lens is None else float(polished.lens.focal_std.max())
             add_imu(result, self.imu, on_poses, focal_std)
-        if self.mapper.without_prior:
-            result.notes.append(f"The map went on without the depth prior: {self.mapper.without_prior}.")
         return result
 
-    def _polished(
-        self, control: LocatedControl | None, factors: ShotFactors | None, progress: Progress | None
-    ) -> Polished:
-        return polish(
-            self.images,
-            self.mapper.points.all(),
-            np.array([self.mapper.focal]),
-            self.options,
-            lambda stage: progress(stage, 0, None) if progress else None,
-            distortion_of(self.camera) if self.options.estimates_lens else None,
-            control=control,
-            factors=factors,
-            joining=self._imu_joining if factors is None and self.imu is not None else None,
-            first_focal=(np.array([self.mapper.first_focal]), first_focal_std(self.camera, given=self.lens_given)),
-            recording=self._recording(),
+    def _measured(self) -> MeasuredShot:
+        """What the polish takes from the stream."""
+        notes = []
+        if self.without_depth:
+            count, first = len(self.without_depth), next(iter(self.without_depth.values()))
+            notes.append(f"Frames that went without depth because the prior failed: {count}; {first}.")
+        if self.mapper.without_prior:
+            notes.append(f"The map went on without the depth prior: {self.mapper.without_prior}.")
+        measured = MeasuredShot(
+            frames=[RecordedFrame(frame.index, frame.name, frame.timestamp) for frame in self.frames],
+            footage=self.footage,
+            images=self.images,
+            map_points=self.mapper.points.all(),
+            colors=self.colors,
+            camera=self.camera,
+            lens_given=self.lens_given,
+            first_focal=(self.mapper.first_focal, first_focal_std(self.camera, given=self.lens_given)),
+            depth_kind=None if self.depth is None else self.depth.kind,
             suspects=self.suspects,
-            in_time=True,
+            supervised=SupervisedTracks.none(),
+            options=self.options,
+            control=self.control,
+            notes=tuple(notes),
         )
-
-    def _recording(self) -> Recording | None:
-        """What a rolling shutter is looked for in."""
-        shutter = self.options.shutter
-        if shutter == "global" or (shutter == "auto" and self.control is not None):
-            return None
-        focal = np.array([self.camera.focal_length_x, self.camera.focal_length_y])
-        size = (self.camera.width, self.camera.height)
-        return Recording(*size, self.times, focal / focal.mean())
+        return measured if self.tracks is None else joined(measured, self.tracks)
 
     def _factors(self) -> ShotFactors | None:
         """Those that were added to the live graph, with the poses that these are beside."""
@@ -173,8 +143,3 @@ class EndedShot:
         (graph, values), scale = found
         added = AddedFactors.of(range(graph.size()), graph, values)
         return self._beside(added, {k: (poses.rotation[k], scale * poses.translation[k]) for k in rows})
-
-    def _located_control(self) -> LocatedControl | None:
-        if self.control is None:
-            return None
-        return locate(self.control, self.frames, lambda position, xy: (self.camera, xy))

@@ -20,12 +20,15 @@ from factorsfm.graph.process import GraphProcess
 from factorsfm.inertial.recording import ImuRecording
 from factorsfm.lens.camera_model import distortion_of
 from factorsfm.mapping.mapper import Mapper
+from factorsfm.mending.user_tracks import UserTracks
 from factorsfm.priors.depth import DepthPrior
 from factorsfm.priors.image_depth import ImageDepth
 from factorsfm.priors.masks import MaskPrior
 from factorsfm.priors.read_priors import read_mask
 from factorsfm.report.thumbnails import Thumbnails
+from factorsfm.result.lost_frames import with_large_steps
 from factorsfm.result.reconstruction import Reconstruction
+from factorsfm.result.repeats import add_recorded, add_results
 from factorsfm.streaming.depth_reader import DepthReader
 from factorsfm.streaming.finishing import EndedShot
 from factorsfm.streaming.footage import Footage
@@ -42,7 +45,6 @@ from factorsfm.streaming.frame_update import (
 )
 from factorsfm.streaming.horizon import FRAMES, Horizon, recent
 from factorsfm.streaming.imu_source import ImuSource, restore_imu
-from factorsfm.streaming.lost_frames import with_large_steps
 from factorsfm.streaming.snapshot import read_snapshot, write_snapshot
 from factorsfm.streaming.suspicion import Suspicion
 from factorsfm.streaming.view_finder import ViewFinder
@@ -176,7 +178,7 @@ class Stream(Closing):
         if self._mapper is None:
             return []
         self._mapper.refresh()
-        return self._footage.with_repeats([pose_of(image) for image in self._mapper.images])
+        return self._footage.recorded.with_repeats([pose_of(image) for image in self._mapper.images])
 
     def graph(self) -> LiveGraph:
         """A copy of the live factor graph, and its values; both empty before the second keyframe.
@@ -237,7 +239,7 @@ class Stream(Closing):
     def all_tracks(self) -> list[ImageTracks]:
         """The tracks of every frame so far, whether the map holds them or not; a repeated frame has its twin's."""
         images = self._mapper.images if self._mapper is not None else []
-        return self._footage.with_repeats([image.tracks for image in images])
+        return self._footage.recorded.with_repeats([image.tracks for image in images])
 
     @property
     def track_ids(self) -> NDArray[np.int64]:
@@ -274,13 +276,9 @@ class Stream(Closing):
 
     @classmethod
     def load(
-        cls,
-        path: str | Path,
-        *,
-        depth: DepthPrior | None = None,
-        masks: MaskPrior | None = None,
-        imu: ImuRecording | None = None,
-    ) -> Stream:
+        cls, path: str | Path, *,
+        depth: DepthPrior | None = None, masks: MaskPrior | None = None, imu: ImuRecording | None = None,
+    ) -> Stream:  # fmt: skip
         """Go on where a stream was saved; the next frame to push is number `len(stream.frames)`.
 
         Args:
@@ -319,28 +317,28 @@ class Stream(Closing):
         self._horizon = Horizon(**state["horizon"])
         restore_imu(self._imu, state["imu"])
 
-    def finish(self, progress: Progress | None = None) -> Reconstruction:
-        """Polish over all frames and tracks.
+    def finish(self, progress: Progress | None = None, *, tracks: UserTracks | None = None) -> Reconstruction:
+        """Polish over all frames and tracks, those of the user too.
 
         Raises:
-            InputError: the control names a frame that is not there.
+            InputError: control or tracks of the user cannot be used with these frames.
             ReconstructionError: no frame could be registered, or too few points remain.
         """
         with self:
             try:
-                ended = self._ended()
+                ended = self._ended(tracks)
                 result = self._horizon.with_all(ended.reconstruction(progress), self.frames, ended.mapper.images)
             except ReconstructionError as error:
                 images = self._mapper.images if self._mapper is not None else []
                 frames = frame_results(self.frames, images)
                 self._thumbnails.attach(frames)
                 reason = with_large_steps(str(error), frames, images)
-                raise ReconstructionError(reason, self._footage.add_results(frames)) from error
+                raise ReconstructionError(reason, add_results(frames, self._footage.recorded)) from error
             self._thumbnails.attach(result.frames)
-            self._footage.add_to(result)
+            add_recorded(result, self._footage.recorded)
             return result
 
-    def _ended(self) -> EndedShot:
+    def _ended(self, tracks: UserTracks | None) -> EndedShot:
         """The shot, now that no more frames come."""
         if self._mapper is None or len(self.frames) < 2:
             raise ReconstructionError(f"frames in the shot: {len(self.frames)}, at least 2 needed")
@@ -354,10 +352,10 @@ class Stream(Closing):
         begin = self._horizon.begin
         return EndedShot(
             frames=self.frames[begin:], images=recent(self._mapper.images, begin), mapper=self._mapper,
-            times=self._footage.times(self.frames)[begin:], interval=self._footage.interval(self.frames),
             colors=self._colors.table, camera=self.camera, lens_given=self._lens_given, depth=self._depth.prior,
-            without_depth=self._depth.failed, control=self.control, imu=self._imu, options=self.options,
-            seconds=self.seconds, suspects=suspects,
+            without_depth=self._depth.failed, control=self.control, imu=self._imu,
+            footage=self._footage.recorded.of(range(begin, len(self.frames))), options=self.options,
+            seconds=self.seconds, suspects=suspects, tracks=tracks,
         )  # fmt: skip
 
     def close(self) -> None:

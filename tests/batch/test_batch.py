@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import pytest
 
+from factorsfm import read_result
 from factorsfm.batch.crew import WorkerLostError, open_crew
 from factorsfm.batch.plan import Job, Method, find_videos, plan_jobs
 from factorsfm.camera.files import camera_to_json
@@ -129,9 +130,10 @@ def test_what_is_done_is_not_done_again(
     assert batch() == 0
     changed = {path.parent for path, time_ in written(tmp_path / "out").items() if time_ != first[path]}
     assert changed == {second}
-    assert batch("--preset", "geometry") == 0
+    assert batch("--preset", "geometry", "--align") == 0
     summary = json.loads((bad / "summary.json").read_text())
     assert summary["options"]["job"]["preset"] == "geometry"
+    assert read_result(second).alignment is not None
     assert {path for path, time_ in written(tmp_path / "out").items() if time_ == first[path]} == set()
     monkeypatch.undo()
 

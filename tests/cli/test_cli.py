@@ -69,6 +69,7 @@ def test_reconstruct_writes_the_result(
         "lens": "auto",
         "shutter": "auto",
         "control": None,
+        "tracks": None,
         "imu": None,
         "preset": "default",
         "unordered": None,

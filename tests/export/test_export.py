@@ -60,7 +60,7 @@ def test_colmap_model_reprojects_exactly_in_pycolmap(tmp_path: Path) -> None:
             pixel = camera.img_from_cam((image.cam_from_world() * xyz)[None])[0]
             worst = max(worst, float(np.abs(pixel - point2d.xy).max()))
     assert worst < 1e-6  # the text holds six decimals of a pixel
-    point = model.point3D(8)
+    point = model.point3D(int(reconstruction.track_ids[7]) + 1)
     np.testing.assert_array_equal(point.xyz, reconstruction.points[7])
     np.testing.assert_array_equal(point.color, reconstruction.colors[7])
     assert point.error == pytest.approx(0.1 * np.mean([1, 2, 3, 5, 6]), rel=1e-5)
@@ -80,7 +80,7 @@ def test_colmap_text_in_a_plain_parser(tmp_path: Path) -> None:
         atol=1e-6,
     )
     tracks = [line.split() for line in (tmp_path / "points3D.txt").read_text().splitlines()[1:]]
-    assert [int(t[0]) for t in tracks] == list(range(1, 41))
+    assert [int(t[0]) for t in tracks] == list(range(101, 141))
     for track in tracks:
         for image_id, place in np.array(track[8:], int).reshape(-1, 2):
             row = images[2 * [11, 13, 15, 19, 21].index(image_id) + 1].split()
@@ -98,7 +98,7 @@ def test_colmap_leaves_out_points_seen_by_fewer_than_two_registered_frames(tmp_p
     reconstruction.observation_error = np.full(int(keep.sum()), np.nan)
     write_colmap(reconstruction, tmp_path)
     model = pycolmap.Reconstruction(tmp_path)
-    assert set(model.points3D) == set(range(1, 41)) - {6, 7}
+    assert set(model.points3D) == set(range(101, 141)) - {106, 107}
     assert all(len(image.points2D) == 38 for image in model.images.values())
     assert all(point.error == -1 for point in model.points3D.values())
 

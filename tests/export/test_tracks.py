@@ -29,7 +29,7 @@ def expected() -> dict[tuple[str, int], np.ndarray]:
         if frame.cam_from_world is not None:
             x, y, z = frame.cam_from_world * result.points[point]
             flat = [500 * x / z + 321, 510 * y / z + 239]
-            found[f"track_{point + 1:05d}", FIRST + frame.index] = np.array([*(xy + 0.5), *flat])
+            found[f"track_{result.track_ids[point] + 1:05d}", FIRST + frame.index] = np.array([*(xy + 0.5), *flat])
     return found
 
 

@@ -1,5 +1,6 @@
 """Headless Chromium, driven through its debugging pipe: real keys and pointers, and what the page asks and says."""
 
+import base64
 import json
 import os
 import select
@@ -74,7 +75,7 @@ class Chromium:
         return answer["result"].get("value")
 
     def press(self, key: str) -> None:
-        text = {"text": key} if len(key) == 1 else {}
+        text = {"text": key} if len(key) == 1 else {"text": "\r"} if key == "Enter" else {}
         for kind in ("keyDown", "keyUp"):
             self._ask("Input.dispatchKeyEvent", type=kind, key=key, code=key, **(text if kind == "keyDown" else {}))
 
@@ -87,6 +88,17 @@ class Chromium:
         for kind, share in (("mousePressed", 0.0), ("mouseMoved", 0.5), ("mouseMoved", 1.0), ("mouseReleased", 1.0)):
             at = {"x": x + share * dx, "y": y + share * dy}
             self._ask("Input.dispatchMouseEvent", type=kind, button="left", buttons=1, clickCount=1, **at)
+
+    def click(self, x: float, y: float) -> None:
+        """At a place of the window."""
+        for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
+            self._ask("Input.dispatchMouseEvent", type=kind, button="left", buttons=1, clickCount=1, x=x, y=y)
+
+    def screenshot(self, area: tuple[float, float, float, float]) -> bytes:
+        """JPEG of a part of the page, also of what the window does not show: left, top, width, height."""
+        clip = {**dict(zip(("x", "y", "width", "height"), area, strict=True)), "scale": 0.8}
+        answer = self._ask("Page.captureScreenshot", format="jpeg", quality=75, captureBeyondViewport=True, clip=clip)
+        return base64.b64decode(answer["data"])
 
     def close(self) -> None:
         os.close(self._commands)  # Chromium ends with its pipe

@@ -1,5 +1,6 @@
 """The report in a real browser: it draws, follows slider, keys and pointer, fits its window, and asks nobody."""
 
+import shlex
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -164,6 +165,36 @@ def test_the_slider_moves_everything(report: Report) -> None:
     moved = "new Promise(done => setInterval(() => seek.position !== 5 && done(true), 10))"
     assert report.run(f"byId('play').click(); Promise.race([{moved}, new Promise(done => setTimeout(done, 10000))])")
     assert report.run("byId('play').click(), byId('play').textContent") == "Play"
+
+
+def test_tracks_are_sorted_shown_and_left_out_by_the_copied_command(report: Report) -> None:
+    reconstruction = with_thumbnails(build())
+    wrong = np.isin(reconstruction.observation_point, [7, 31])
+    reconstruction.observation_error = np.where(wrong, 5.0 + reconstruction.observation_error, 0.2)
+    report.open(report_html(reconstruction, "shots/it's here"))
+    first = "[...byId('tracks_rows').rows].slice(0, 2).map(row => row.cells[1].textContent)"
+    assert report.run(first) == ["track_00108", "track_00132"]
+    plain = {canvas: report.digest(canvas) for canvas in ("footage", "pointed")}
+    report.run("byId('tracks_rows').rows[0].querySelector('button').click()")
+    assert report.text("status").startswith("Frame 20 ")  # where its error is largest
+    report.run("goTo(0)")
+    assert [canvas for canvas in plain if report.digest(canvas) == plain[canvas]] == []
+    report.run("document.querySelector('[data-sort=name]').click()")
+    assert report.run(first) == ["track_00101", "track_00102"]
+    for name in ("track_00132", "track_00108"):
+        row = f"[...byId('tracks_rows').rows].find(row => row.cells[1].textContent === '{name}')"
+        report.run(f"{row}.querySelector('input').click()")
+    command = report.run("byId('mend_command').value")
+    assert shlex.split(command)[:2] == ["factorsfm", "solve"]
+    assert shlex.split(command)[2:] == [
+        "shots/it's here", "--without-tracks", "108", "132", "--output", "shots/it's here-mended",
+    ]  # fmt: skip
+    copied = "new Promise(done => setInterval(() => byId('mend_copy').textContent === 'Copied' && done(true), 10))"
+    assert report.run(f"byId('mend_copy').click(); {copied}")
+    report.run("byId('mend_none').click()")
+    assert report.run("byId('mend_command').value") == ""
+    report.open(report_html(reconstruction))  # of images in any order: nothing to solve again
+    assert report.hidden("tracks_section", "mend_controls", "mend_column") == [False, True, True]
 
 
 def test_the_scene_turns(report: Report) -> None:

@@ -6,8 +6,8 @@ import pytest
 
 import factorsfm
 from factorsfm.mapping.mapped_images import MappedImage
+from factorsfm.result.lost_frames import lost_frames
 from factorsfm.result.reconstruction import FrameResult
-from factorsfm.streaming.lost_frames import lost_frames
 from factorsfm.support.errors import ReconstructionError
 from factorsfm.support.status import FrameStatus
 from factorsfm.tracks.image_tracks import ImageTracks

@@ -1,0 +1,202 @@
+"""2-D tracks of the user: placed by hand, or made by another program, and read from its file.
+
+The files are those that `export` writes: the table (CSV), Nuke's Tracker and 3DEqualizer's text.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factorsfm.export.formats import FORMATS
+from factorsfm.export.shot import first_frame_of
+from factorsfm.mending.nuke_tracker import nuke_tracks
+from factorsfm.support.errors import InputError
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Plate = Literal["footage", "undistorted"]
+_Curves = dict[str, dict[int, tuple[float, float]]]  # by name and number of the frame, in pixels of the format
+
+DEFAULT_SIGMA_PX = 0.5  # of a place that a person has set with care; automatic trackers are better
+_LARGEST = 1e6  # pixels and numbers of frames: beyond, a file holds something else
+_LONGEST_NAME = 100
+
+
+@dataclass(frozen=True, slots=True)
+class UserTrack:
+    """A track.
+
+    Attributes:
+        name: as the user calls it.
+        frames: (k,) numbers of the frames as in a result, ascending.
+        xy: (k, 2) pixels with centres at integers; see `UserTracks`.
+
+    Raises:
+        InputError: there is no place, a frame is there twice, or a value is none.
+    """
+
+    name: str
+    frames: Index
+    xy: Array
+
+    def __post_init__(self) -> None:
+        frames, xy = np.asarray(self.frames), np.asarray(self.xy, np.float64)
+        if frames.ndim != 1 or xy.shape != (len(frames), 2) or not len(frames):
+            raise InputError(f'track "{self.name}" has frames of shape {frames.shape} and places of shape {xy.shape}')
+        if (np.diff(frames) <= 0).any():
+            raise InputError(f'the frames of track "{self.name}" do not ascend')
+        if not (np.abs(xy) < _LARGEST).all() or (np.abs(frames) > _LARGEST).any():
+            raise InputError(f'track "{self.name}" has a place or a frame that is none')
+        if not self.name.strip() or len(self.name) > _LONGEST_NAME or not self.name.isprintable():
+            raise InputError(f"a track is called {self.name[:_LONGEST_NAME]!r}; a name in one line is expected")
+
+
+@dataclass(frozen=True, slots=True)
+class UserTracks:
+    """Tracks that the user vouches for.
+
+    Attributes:
+        tracks: with different names.
+        sigma: standard deviation of each coordinate of their places, pixels.
+        on: the plate on which they lie: the "footage" with its distortion, or the footage "undistorted".
+        from_bottom: whether their y counts upwards, from the bottom edge of the image (not from a pixel's centre).
+        source: where they come from, for people.
+
+    Raises:
+        InputError: there is no track, two have the same name, or the standard deviation is none.
+    """
+
+    tracks: Sequence[UserTrack]
+    sigma: float = DEFAULT_SIGMA_PX
+    on: Plate = "footage"
+    from_bottom: bool = False
+    source: str = "the tracks"
+
+    def __post_init__(self) -> None:
+        if not self.tracks:
+            raise InputError(f"{self.source}: there is no track")
+        names = [track.name for track in self.tracks]
+        if len({*names}) < len(names):
+            twice = next(name for k, name in enumerate(names) if name in names[:k])
+            raise InputError(f'{self.source}: track "{twice}" is there twice')
+        if not 1e-3 <= self.sigma <= 1e3:
+            raise InputError(
+                f"the standard deviation of the tracks is {self.sigma:g}; 0.001 to 1000 pixels is expected"
+            )
+        if self.on not in get_args(Plate):
+            raise InputError(f'the tracks lie on "{self.on}"; one of {", ".join(get_args(Plate))} is expected')
+
+
+def read_tracks(
+    path: str | Path,
+    *,
+    first_number: int | None = None,
+    first_frame: int | None = None,
+    sigma: float = DEFAULT_SIGMA_PX,
+    on: Plate | None = None,
+) -> UserTracks:
+    """Read tracks from a file in one of the formats "tracks-csv", "tracks-nuke" and "tracks-3de" of `export`.
+
+    Args:
+        first_number: with which the numbered sequence begins that is the source; None for all other sources.
+        first_frame: number of the first frame of the source in the file; None is that of an export.
+        sigma: see `UserTracks`.
+        on: see `UserTracks`; None is the plate of an export: "undistorted" for Nuke, else "footage".
+
+    Raises:
+        InputError: the file cannot be read, or is none of these.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise InputError(f"tracks {path} cannot be read: {error.strerror or error}") from error
+    except ValueError as error:
+        raise InputError(f"tracks {path} are no text") from error
+    format, read = _format_of(text, path)
+    shift = first_frame_of(first_number, first_frame, FORMATS[format].defaults)
+    corner = np.array([0.5, 0.5 if format == "tracks-csv" else 0.0])  # y from the bottom stays as it is
+    try:
+        tracks = [
+            UserTrack(
+                name.strip(),
+                np.array(sorted(places), np.int64) - shift,
+                np.array([places[number] for number in sorted(places)]) - corner,
+            )
+            for name, places in read(text).items()
+        ]
+    except (ValueError, LookupError, OverflowError, RecursionError, InputError) as error:
+        raise InputError(f"tracks {path}: {error}") from error
+    plate: Plate = on or ("undistorted" if format == "tracks-nuke" else "footage")
+    return UserTracks(tracks, sigma, plate, format != "tracks-csv", f"tracks {path}")
+
+
+def _format_of(text: str, path: Path) -> tuple[str, Callable[[str], _Curves]]:
+    start = text.lstrip()
+    if re.search(r"^\s*Tracker4\s*\{", text, re.MULTILINE):
+        return "tracks-nuke", nuke_tracks
+    if re.match(r"\d+\s*\n", start):
+        return "tracks-3de", _of_3de
+    if "," in start.partition("\n")[0]:
+        return "tracks-csv", _of_table
+    raise InputError(
+        f"tracks {path}: neither a table with track, frame, x and y, nor a script with Nuke's Tracker4, nor "
+        "3DEqualizer's text of 2-D tracks"
+    )
+
+
+def _of_table(text: str) -> _Curves:
+    """A header with track, frame, x and y, and further columns that are not read."""
+    reader = csv.DictReader(io.StringIO(text))
+    columns = reader.fieldnames or []
+    if missing := [name for name in ("track", "frame", "x", "y") if name not in columns]:
+        raise ValueError(f"the table has no column {missing[0]}; it has {', '.join(columns)}")
+    found: _Curves = defaultdict(dict)
+    for row in reader:
+        _add(found[row["track"] or ""], row["track"], row["frame"], row["x"], row["y"], f"line {reader.line_num}")
+    return found
+
+
+def _of_3de(text: str) -> _Curves:
+    """The number of tracks; then of each its name, colour, length, and frame, x and y of each place."""
+    lines = iter(line for line in text.splitlines() if line.strip())
+    found: _Curves = {}
+    try:
+        for _ in range(_count(next(lines), "tracks")):
+            name = next(lines).strip()
+            next(lines)
+            if name in found:
+                raise ValueError(f'track "{name}" is there twice')
+            found[name] = {}
+            for _ in range(_count(next(lines), f'places of track "{name}"')):
+                number, x, y = (*next(lines).split(), "", "", "")[:3]
+                _add(found[name], name, number, x, y, f'a line of track "{name}"')
+    except StopIteration:
+        raise ValueError("the text ends before its last track does") from None
+    return found
+
+
+def _count(text: str, what: str) -> int:
+    if not text.strip().isdecimal():
+        raise ValueError(f'"{text.strip()}" is no number of {what}')
+    return int(text)
+
+
+def _add(places: dict[int, tuple[float, float]], name: str | None, number: str, x: str, y: str, where: str) -> None:
+    try:
+        frame, place = int(number), (float(x), float(y))
+    except (ValueError, TypeError):
+        raise ValueError(f"{where} is {number!r}, {x!r}, {y!r}; a frame and two numbers are expected") from None
+    if frame in places:
+        raise ValueError(f'track "{name}" has frame {frame} twice')
+    places[frame] = place

@@ -1,0 +1,224 @@
+"""A result solved again from its tracks: the same without changes, and without what is left out."""
+
+import zipfile
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import factorsfm
+from factorsfm import (
+    Control,
+    Frame,
+    InputError,
+    KnownDistance,
+    MaskRegion,
+    Options,
+    Reconstruction,
+    Stream,
+    solve_again,
+)
+from factorsfm.cli.main import main
+from factorsfm.report.thumbnails import thumbnail
+from factorsfm.result.alignment import Alignment
+from factorsfm.result.other_world import in_other_world
+from factorsfm.result.tracks_file import read_tracks, write_tracks
+from factorsfm.support.similarity import Similarity
+from tests.command_line import assert_error
+from tests.rendered import FRAMES, Maps, rendered, simulated_maps, with_fewer_tracks
+
+SHOWN = [0, 1, 2, 3, 3, 4, 5, 6, 7]  # the frame with index 4 repeats the one before
+MAPS = [simulated_maps("dolly")[k] for k in SHOWN]
+
+
+@pytest.fixture(scope="module")
+def result() -> Reconstruction:
+    rng, shot = np.random.default_rng(3), rendered("dolly")
+    images = [np.clip(image + rng.normal(0, 2, image.shape), 0, 255).astype(np.uint8) for image in shot.images]
+    with Stream(shot.camera, depth=Maps(MAPS), options=with_fewer_tracks(Options())) as stream:
+        for index, k in enumerate(SHOWN):
+            stream.push(Frame(index, images[k], f"{index:06d}", index / 24))
+        return stream.finish()
+
+
+@pytest.fixture(scope="module")
+def folder(result: Reconstruction, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("solved") / "result"
+    result.write(folder)
+    return folder
+
+
+def centers_of(result: Reconstruction) -> dict[int, np.ndarray]:
+    return {frame.index: frame.cam_from_world.inverse().translation for frame in result.registered}
+
+
+def assert_same_cameras(result: Reconstruction, known: Reconstruction, share: float, size: float = 1.0) -> None:
+    """Within a share of the standard deviations of the known result, whose world may be `size` times as large."""
+    assert [frame.index for frame in result.frames] == [frame.index for frame in known.frames]
+    for frame, other in list(zip(result.frames, known.frames, strict=True))[1:]:
+        off = frame.cam_from_world * other.cam_from_world.inverse()
+        std = np.sqrt(np.diag(other.covariance)) * np.repeat([1.0, size], 3)
+        turn = 2.0 * np.asarray(off.rotation.quat)[:3]
+        assert (np.abs(np.r_[turn, off.translation]) < share * std).all()
+
+
+def test_the_file_holds_what_was_measured(result: Reconstruction, folder: Path, tmp_path: Path) -> None:
+    known, read = result.measured, read_tracks(folder / "tracks.npz")
+    assert known is not None
+    assert read is not None
+    assert (read.frames, read.footage, read.options) == (known.frames, known.footage, known.options)
+    assert read.footage.repeats[0].index == 4
+    assert read.depth_kind is known.depth_kind
+    assert read.camera == known.camera
+    for image, other in zip(read.images, known.images, strict=True):
+        np.testing.assert_array_equal(image.tracks.ids, other.tracks.ids)
+        np.testing.assert_allclose(image.tracks.pixels, other.tracks.pixels, atol=1e-4)
+        np.testing.assert_array_equal(image.rotation, other.rotation)
+        assert (image.tracks.depth is None) == (other.tracks.depth is None)
+        if other.tracks.depth is not None:
+            valid = other.tracks.depth.valid
+            np.testing.assert_array_equal(image.tracks.depth.valid, valid)
+            np.testing.assert_allclose(
+                image.tracks.depth.inverse_depth[valid], other.tracks.depth.inverse_depth[valid], rtol=1e-6
+            )
+    np.testing.assert_array_equal(read.colors[result.track_ids], result.colors)
+    observations = sum(len(image.tracks.ids) for image in known.images)
+    assert (folder / "tracks.npz").stat().st_size < 12 * observations + 8000
+    write_tracks(read, tmp_path / "again.npz")
+    assert (tmp_path / "again.npz").read_bytes() == (folder / "tracks.npz").read_bytes()
+
+
+def test_without_a_change_the_cameras_are_the_same(result: Reconstruction, folder: Path) -> None:
+    again = solve_again(folder)
+    assert_same_cameras(again, result, 0.01)
+    assert again.frames[4].repeats == 3
+    np.testing.assert_array_equal(again.track_ids, result.track_ids)
+    assert again.notes == result.notes
+    assert again.frames[1].covariance == pytest.approx(result.frames[1].covariance, rel=1e-3)
+    assert (again.frames[0].prior is None) == (result.frames[0].prior is None)
+
+
+def test_tracks_regions_and_frames_are_left_out(result: Reconstruction, folder: Path, tmp_path: Path) -> None:
+    gone = result.track_ids[[3, 17]] + 1
+    again = solve_again(folder, without_tracks=[int(gone[0]), f"track_{gone[1]:05d}"])
+    assert_same_cameras(again, result, 1.0)
+    assert not np.isin(again.track_ids + 1, gone).any()
+    assert again.notes[-1] == f"Solved again without 2 tracks: track_{gone[0]:05d}, track_{gone[1]:05d}."
+    assert again.options["solved_again"][0]["without_tracks"] == [str(gone[0]), f"track_{gone[1]:05d}"]
+    again.write(tmp_path / "again")
+    further = solve_again(
+        tmp_path / "again", mask_regions=["2:3:0,0,80,200", MaskRegion(300, 0, 100, 200)], frames=slice(1, 9)
+    )
+    assert [frame.index for frame in further.frames] == list(range(1, 9))
+    assert not np.isin(further.track_ids + 1, gone).any()
+    index = np.array([frame.index for frame in further.frames])[further.observation_frame]
+    x = further.observation_xy[:, 0]
+    assert x[index == 2].min() > 79.9
+    assert x[index > 2].min() < 60
+    assert x.max() < 300
+    assert further.frames[3].repeats == 3
+    assert [change["frames"] for change in further.options["solved_again"]] == [None, "1:9:1"]
+    known = centers_of(result)
+    for number, center in centers_of(further).items():  # the first frame is gone, and the world stays
+        np.testing.assert_allclose(center, known[number], atol=2e-3)
+
+
+def test_the_world_stays(result: Reconstruction) -> None:
+    turned = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    alignment = Alignment(["ground"], 0.1, "points", 1.0, 0.1, 40, 1.0, "foot", None, "camera", None, None)
+    known = in_other_world(result, Similarity(2.5, turned, np.array([1.0, 2.0, 3.0])))
+    known = replace(known, alignment=alignment, metric=True)
+    again = solve_again(known)
+    assert_same_cameras(again, known, 0.01)
+    assert (again.alignment, again.metric) == (alignment, True)
+    np.testing.assert_allclose(again.points, known.points, rtol=1e-3)
+
+
+def test_control_is_kept_until_there_is_another(result: Reconstruction, tmp_path: Path) -> None:
+    def between(metres: float) -> Control:
+        return Control(distances=[KnownDistance(metres, 0.01, frames=[0, 8])])
+
+    surveyed = solve_again(result, control=between(3.0))
+    surveyed.write(tmp_path / "surveyed")
+    for solved, metres in (
+        (solve_again(tmp_path / "surveyed"), 3.0),
+        (solve_again(surveyed, control=between(5.0)), 5.0),
+    ):
+        centers = centers_of(solved)
+        assert np.linalg.norm(centers[8] - centers[0]) == pytest.approx(metres, rel=1e-3)
+        assert solved.metric
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"without_tracks": [999999]}, "no track 999999 among the"),
+        ({"without_tracks": ["door"]}, "no track door"),
+        ({"mask_regions": ["0,0,10"]}, '"0,0,10" is no region'),
+        ({"mask_regions": ["0,0,10,0"]}, "is empty"),
+        ({"mask_regions": ["5:3:0,0,9,9"]}, "empty"),
+        ({"mask_regions": ["9000,0,9,9"]}, "no track is in the region 9000,0,9,9"),
+        ({"frames": slice(40, 50)}, "no frame of the result is in 40:50:1; it has 0 to 8"),
+    ],
+)
+def test_changes_that_cannot_be_made(result: Reconstruction, change: dict, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        solve_again(result, **change)
+
+
+def test_too_little_is_left(result: Reconstruction) -> None:
+    with pytest.raises(factorsfm.ReconstructionError):
+        solve_again(result, mask_regions=[MaskRegion(-1, -1, 400, 175)])
+
+
+def test_a_damaged_file_is_refused(folder: Path, tmp_path: Path) -> None:
+    good = folder / "tracks.npz"
+    arrays = dict(np.load(good))
+
+    def damaged() -> Iterator[dict]:
+        yield {**arrays, "track": arrays["track"][::-1]}
+        yield {**arrays, "xy": arrays["xy"][:-1]}
+        yield {**arrays, "xy": np.full_like(arrays["xy"], np.nan)}
+        yield {**arrays, "frame_start": arrays["frame_start"] + 1}
+        yield {**arrays, "color_track": arrays["color_track"] + 1}
+        yield {**arrays, "point": arrays["point"].astype("<f4")}
+        yield {**arrays, "facts": np.array("{}")}
+        yield {**arrays, "facts": np.array(str(arrays["facts"]).replace('"format":1', '"format":2'))}
+        yield {name: array for name, array in arrays.items() if name != "suspect"}
+
+    for number, content in enumerate(damaged()):
+        np.savez_compressed(tmp_path / f"{number}.npz", **content)
+        with pytest.raises(InputError, match="is damaged"):
+            read_tracks(tmp_path / f"{number}.npz")
+    data = good.read_bytes()
+    for cut in (0, 10, len(data) // 2):
+        (tmp_path / "cut.npz").write_bytes(data[:cut])
+        with pytest.raises(InputError, match="is damaged"):
+            read_tracks(tmp_path / "cut.npz")
+    with zipfile.ZipFile(tmp_path / "other.npz", "w") as archive:
+        archive.writestr("a.txt", "no arrays")
+    with pytest.raises(InputError, match="is damaged"):
+        read_tracks(tmp_path / "other.npz")
+
+
+def test_the_command(result: Reconstruction, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    result.frames[2].thumbnail = thumbnail(np.full((90, 160, 3), 77, np.uint8))
+    result.write(folder)
+    track = str(result.track_ids[5] + 1)
+    command = ["solve", str(folder), "--without-tracks", track, "--mask-region", "0:2:0,0,40,40", "--frames", "0:8"]
+    assert main([*command, "--output", str(tmp_path / "mended")]) == 0
+    assert f"Solved again without 1 track: track_{int(track):05d}." in capsys.readouterr().out
+    mended = factorsfm.read_result(tmp_path / "mended")
+    assert len(mended.frames) == FRAMES
+    assert mended.measured is not None
+    report = (tmp_path / "mended" / "report.html").read_text()
+    assert report.count('"/9j/') == 8  # the pictures are those of the first report
+    assert f'"folder":"{tmp_path / "mended"}"' in report
+    assert main([*command, "--output", str(folder)]) == 2
+    assert_error(capsys.readouterr(), "choose another one")
+    (tmp_path / "mended" / "tracks.npz").unlink()
+    assert main(["solve", str(tmp_path / "mended"), "--output", str(tmp_path / "further")]) == 2
+    assert_error(capsys.readouterr(), "keeps no tracks to solve again")
+    assert not (tmp_path / "further").exists()

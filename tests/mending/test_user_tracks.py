@@ -1,0 +1,311 @@
+"""Tracks of the user: read as they were written, and solved with their own weight, named, never lost without a word."""
+
+import csv
+import json
+import re
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from factorsfm import (
+    ExportOptions,
+    InputError,
+    Options,
+    Reconstruction,
+    Stream,
+    UserTrack,
+    UserTracks,
+    read_result,
+    read_tracks,
+    reconstruct,
+    solve_again,
+)
+from factorsfm.adjustment.observations import Observations
+from factorsfm.adjustment.track_errors import measure_track_errors
+from factorsfm.cli.main import main
+from factorsfm.export import export
+from factorsfm.mending.joined import on_footage
+from tests.command_line import assert_error
+from tests.exact_result import build
+from tests.exported_files import after_effects_tracks, nuke_curves, nuke_nodes
+from tests.rendered import FRAMES, rendered, with_fewer_tracks
+from tests.report.chromium import EXECUTABLE, MISSING, Chromium
+
+
+@pytest.mark.parametrize("format", ["tracks-csv", "tracks-nuke", "tracks-3de"])
+@pytest.mark.parametrize("first_frame", [None, 77])
+def test_what_export_writes_is_read_back(format: str, first_frame: int | None, tmp_path: Path) -> None:
+    result = build()
+    export(result, tmp_path / "tracks", format=format, options=ExportOptions(first_frame=first_frame))
+    read = read_tracks(tmp_path / "tracks", first_frame=first_frame)
+    names = result.track_names()
+    assert [track.name for track in read.tracks] == names
+    registered = [frame.registered for frame in result.frames]
+    for row, track in enumerate(read.tracks):
+        mine = (result.observation_point == row) & np.array(registered)[result.observation_frame]
+        assert track.frames.tolist() == [result.frames[k].index for k in result.observation_frame[mine]]
+        places = on_footage(track.xy, read, result.camera)
+        np.testing.assert_allclose(places, result.observation_xy[mine], atol=3e-6)
+
+
+def test_a_numbered_sequence_keeps_its_numbers(tmp_path: Path) -> None:
+    result = build()
+    result.options["first_number"] = 10
+    for format in ("tracks-csv", "tracks-nuke", "tracks-3de"):
+        export(result, tmp_path / format, format=format)
+        assert read_tracks(tmp_path / format, first_number=10).tracks[0].frames.tolist() == [10, 12, 14, 18, 20]
+
+
+NUKE = """
+Read { name Read1 }
+Tracker4 {
+ tracks { { 1 31 2 }
+{ { 5 1 20 enable e 1 }
+{ 3 1 75 name name 1 }
+{ 2 1 58 track_x track_x 1 }
+{ 2 1 58 track_y track_y 1 } }
+{ { {curve K x1001 1} "door \\"knob\\"" {curve x1001 10 11.5 x1005 13 i} {curve x1001 L 20 20.25 x1005 21} }
+ { {curve K x1001 1} lamp {curve} {curve} } }
+}
+ name Tracker1
+}
+"""
+
+
+def test_a_script_of_nuke(tmp_path: Path) -> None:
+    (tmp_path / "shot.nk").write_text(NUKE)
+    read = read_tracks(tmp_path / "shot.nk", on="footage")
+    (track,) = read.tracks  # the other one has no keys
+    assert (track.name, track.frames.tolist(), read.on) == ('door "knob"', [0, 1, 4], "footage")
+    camera = build().camera
+    np.testing.assert_allclose(on_footage(track.xy, read, camera), [[9.5, 459.5], [11.0, 459.25], [12.5, 458.5]])
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "neither a table"),
+        ("hello world\n", "neither a table"),
+        ("name,frame,x,y\na,1,2,3\n", "no column track"),
+        ("track,frame,x,y\n", "there is no track"),
+        ("track,frame,x,y\na,1,2\n", "line 2 is '1', '2', None"),
+        ("track,frame,x,y\na,1.5,2,3\n", "line 2 is '1.5'"),
+        ("track,frame,x,y\na,1,2,nan\n", "is none"),
+        ("track,frame,x,y\na,1,2,3\na,1,2,3\n", 'track "a" has frame 1 twice'),
+        ("track,frame,x,y\n ,1,2,3\n", "a name in one line"),
+        ("2\na\n0\n1\n1 2 3\n", "the text ends before its last track"),
+        ("1\na\n0\n1\n1 2\n", "a line of track \"a\" is '1', '2', ''; a frame and two numbers are expected"),
+        ("1\na\n0\nmany\n1 2 3\n", '"many" is no number of places of track "a"'),
+        ("Tracker4 {\n tracks { { 1 2 3 }\n", "not closed"),
+        ("Tracker4 {\n name a\n}\n", "no table of tracks"),
+        (NUKE.replace("track_y track_y", "y y"), "no column track_y"),
+        (NUKE.replace("curve x1001 10 11.5", "curve {parent.x}"), "an expression"),
+    ],
+)
+def test_files_that_cannot_be_read(text: str, words: str, tmp_path: Path) -> None:
+    (tmp_path / "tracks.txt").write_text(text)
+    with pytest.raises(InputError, match=f"tracks.txt.*{words}"):
+        read_tracks(tmp_path / "tracks.txt")
+
+
+@pytest.mark.parametrize(
+    ("tracks", "words"),
+    [
+        (lambda: UserTracks([]), "there is no track"),
+        (lambda: UserTracks([a_track(), a_track()]), "there twice"),
+        (lambda: UserTracks([a_track()], sigma=0.0), "standard deviation of the tracks is 0"),
+        (lambda: UserTracks([a_track()], on="plate"), 'lie on "plate"'),
+        (lambda: a_track(frames=[2, 1]), "do not ascend"),
+        (lambda: a_track(frames=[1]), "of shape"),
+    ],
+)
+def test_tracks_that_are_none(tracks: Any, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        tracks()
+
+
+def a_track(frames: Sequence[int] = (0, 1)) -> UserTrack:
+    return UserTrack("a", np.array(frames), np.array([[10.0, 20.0], [11.0, 21.0]]))
+
+
+def test_known_errors_are_white_and_say_nothing_of_the_others() -> None:
+    rng = np.random.default_rng(0)
+    point, frame = np.repeat(np.arange(40), 20), np.tile(np.arange(20), 40)
+    observations = Observations(frame, point, np.zeros((800, 2)))
+    residual = rng.normal(0, 0.1, (800, 2)) + np.repeat(rng.normal(0, 0.1, (40, 2)), 20, axis=0)
+    alone = measure_track_errors(residual[:600], observations.of(np.arange(30)), 2.0)
+    residual[600:] = 50.0 * rng.normal(0, 0.1, (200, 2))
+    sigma = np.where(np.arange(40) < 30, np.nan, 5.0)
+    found = measure_track_errors(residual, observations, 2.0, sigma)
+    assert found.sigma == alone.sigma
+    np.testing.assert_array_equal(found.root_weight[:600], alone.root_weight)
+    np.testing.assert_array_equal(found.persistent, [*alone.persistent, *np.zeros(10)])
+    assert np.median(found.sigma / found.root_weight[600:]) == pytest.approx(5.0, rel=0.25)
+    assert (found.sigma / found.root_weight[600:]).min() >= 5.0
+
+
+# --- in a solve ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def result() -> Reconstruction:
+    shot = rendered("dolly")
+    with Stream(shot.camera, options=with_fewer_tracks(Options())) as stream:
+        for image in shot.images:
+            stream.push(image)
+        return stream.finish()
+
+
+NAMES = [f"window {k}" for k in range(6)]
+
+
+@pytest.fixture(scope="module")
+def tracks(result: Reconstruction) -> UserTracks:
+    """Of six points of the result with noise of 0.3 pixels, and two that slide by 12 pixels."""
+    rng, chosen = np.random.default_rng(1), np.linspace(0, len(result.points) - 1, 8).astype(int)
+    found = []
+    for name, row in zip([*NAMES, "slides", "slips"], chosen.tolist(), strict=True):
+        seen = [result.camera.img_from_cam(f.cam_from_world * result.points[row]) - 0.5 for f in result.frames]
+        xy = np.array(seen) + rng.normal(0, 0.3, (FRAMES, 2))
+        if name not in NAMES:
+            xy += np.outer(np.sin(np.linspace(0, 3, FRAMES)), rng.choice([-12, 12], 2))
+        found.append(UserTrack(name, np.arange(FRAMES), xy))
+    return UserTracks(found, sigma=0.3)
+
+
+def write_table(tracks: UserTracks, path: Path) -> None:
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["track", "frame", "x", "y"])
+        for track in tracks.tracks:
+            writer.writerows([track.name, f, *(xy + 0.5)] for f, xy in zip(track.frames, track.xy, strict=True))
+
+
+@pytest.fixture(scope="module")
+def solved(result: Reconstruction, tracks: UserTracks, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("tracks")
+    result.write(folder / "result")
+    write_table(tracks, folder / "tracks.csv")
+    command = ["solve", str(folder / "result"), "--tracks", str(folder / "tracks.csv"), "--tracks-sigma", "0.3"]
+    assert main([*command, "--output", str(folder / "solved")]) == 0
+    return folder / "solved"
+
+
+def test_supervised_tracks_become_named_points(result: Reconstruction, solved: Path, tmp_path: Path) -> None:
+    found = read_result(solved)
+    summary = json.loads((solved / "summary.json").read_text())
+    points = {point["name"]: point for point in summary["named_points"]}
+    assert list(points) == [*NAMES, "slides", "slips"]
+    chosen = np.linspace(0, len(result.points) - 1, 8).astype(int)
+    for name, row in zip(NAMES, chosen, strict=False):
+        assert points[name]["error"] == pytest.approx(0.3, rel=0.5)
+        place, known = np.array(points[name]["position"]), result.points[row]
+        pixels = [result.camera.img_from_cam(result.frames[4].cam_from_world * point) for point in (place, known)]
+        assert np.linalg.norm(pixels[0] - pixels[1]) < 0.5
+        assert place[2] == pytest.approx(known[2], rel=0.1)
+        assert not points[name]["contradicts"]
+    for name in ("slides", "slips"):
+        assert points[name]["contradicts"]
+        assert points[name]["error"] > 2.0
+    assert set(points) <= set(found.track_names())
+    export(found, tmp_path / "tracks", format="tracks-3de")
+    assert {track.name for track in read_tracks(tmp_path / "tracks").tracks} >= set(points)
+    worst, next_worst = sorted(("slides", "slips"), key=lambda name: -points[name]["error"])
+    assert found.notes[-1] == (
+        f"Supervised tracks that contradict the others and hardly count: 2 of 8; {worst} "
+        f"({points[worst]['error']:.1f} px), {next_worst} ({points[next_worst]['error']:.1f} px)."
+    )
+    for frame, other in zip(found.frames, result.frames, strict=True):
+        np.testing.assert_allclose(frame.cam_from_world.matrix(), other.cam_from_world.matrix(), atol=2e-3)
+
+
+def test_named_points_are_nulls(solved: Path, tmp_path: Path) -> None:
+    found, points = read_result(solved), json.loads((solved / "summary.json").read_text())["named_points"]
+    x, y, z = next(point["position"] for point in points if point["name"] == "window 2")
+    names = {"nuke": "nuke", "blender": "scene.py", "usd": "a.usda", "after-effects": "ae", "alembic": "a.abc"}
+    for format, name in names.items():
+        export(found, tmp_path / name, format=format, options=ExportOptions(scale=2.0))
+    script = (tmp_path / "nuke" / "camera.nk").read_text()
+    assert "AllPoints" not in script
+    moved = nuke_curves(nuke_nodes(script)["point_window_2"]["translate"])
+    np.testing.assert_allclose(moved[1001], [2 * x, -2 * y, -2 * z], rtol=1e-9)
+    assert not (tmp_path / "nuke" / "point_window_2.obj").exists()
+    nulls = json.loads(eval(re.findall(r"json.loads\((.*)\)\n", (tmp_path / "scene.py").read_text())[0]))["objects"]
+    (null,) = (null for null in nulls if null["name"] == "point_window_2")
+    np.testing.assert_allclose(null["locations"], [[2 * x, 2 * z, -2 * y]], rtol=1e-9)
+    _, keys = after_effects_tracks((tmp_path / "ae" / "point_window_2.txt").read_text())
+    np.testing.assert_allclose(keys["Transform\tPosition"][0], [2 * x + 160, 2 * y + 90, 2 * z], rtol=1e-9)
+    usd = pytest.importorskip("pxr.Usd")
+    stage = usd.Stage.Open(str(tmp_path / "a.usda"))
+    prim = stage.GetPrimAtPath("/factorsfm/point_window_2")
+    translation = prim.GetAttribute("xformOp:transform").Get(1001).ExtractTranslation()
+    np.testing.assert_allclose(translation, [2 * x, -2 * y, -2 * z], rtol=1e-9)
+    assert not prim.GetChildren()
+
+
+def test_they_are_left_out_by_their_names_and_numbers(solved: Path, tmp_path: Path) -> None:
+    number = next(
+        p["track"] for p in json.loads((solved / "summary.json").read_text())["named_points"] if p["name"] == "slips"
+    )
+    out = ["--output", str(tmp_path / "mended")]
+    assert main(["solve", str(solved), "--without-tracks", "slides", str(number), *out]) == 0
+    found = read_result(tmp_path / "mended")
+    assert [name for name in found.track_names() if not name.startswith("track_")] == NAMES
+    assert found.notes == ["Solved again without 2 tracks: slides, slips."]
+
+
+@pytest.mark.skipif(EXECUTABLE is None, reason=MISSING)
+def test_the_report_finds_the_wrong_ones_and_its_command_leaves_them_out(solved: Path, tmp_path: Path) -> None:
+    browser = Chromium(tmp_path / "profile")
+    browser.open(solved / "report.html")
+    named = browser.run("[...byId('tracks_rows').rows].slice(0, 2).map(row => row.cells[1].textContent)")
+    browser.run("[...byId('tracks_rows').rows].slice(0, 2).forEach(row => row.querySelector('input').click())")
+    command = shlex.split(browser.run("byId('mend_command').value"))
+    browser.close()
+    assert {*named} == {"slides", "slips"}
+    assert command[-2:] == ["--output", f"{solved}-mended"]
+    assert main(command[1:]) == 0
+    assert read_result(f"{solved}-mended").notes == ["Solved again without 2 tracks: slides, slips."]
+
+
+def test_a_track_that_cannot_be_placed_is_named(result: Reconstruction, tracks: UserTracks) -> None:
+    first, second = tracks.tracks[:2]
+    once = UserTrack("window 9", np.array([0, 90, 91]), np.array([[5.0, 5.0]] * 3))
+    never = UserTrack("window 10", np.array([90, 91]), np.array([[5.0, 5.0]] * 2))
+    again = UserTrack("track_00001", second.frames, second.xy)
+    found = solve_again(result, tracks=UserTracks([first, once, never, again]))
+    assert [name for name in found.track_names() if name in ("window 0", "track_00001_2", "window 9")] == [
+        "window 0", "track_00001_2",
+    ]  # fmt: skip
+    assert found.notes[-2:] == [
+        "Supervised tracks without a point, since the solved frames do not place it: window 9.",
+        "Of the tracks, 1 of 4 have no frame of the shot.",
+    ]
+    with pytest.raises(InputError, match="no track has two frames of the shot; its frames are 0 to 7"):
+        solve_again(result, tracks=UserTracks([once, never]))
+
+
+def test_reconstruct_takes_them(tracks: UserTracks, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shot = rendered("dolly")
+    undistorted = UserTracks(tracks.tracks, sigma=0.3, on="undistorted")
+    found = reconstruct(shot.images, camera=shot.camera, depth=None, tracks=undistorted)
+    assert set(NAMES) < set(found.track_names())
+    with pytest.raises(InputError, match="tracks on undistorted footage need its lens"):
+        reconstruct(shot.images, depth=None, tracks=undistorted)
+    with pytest.raises(InputError, match="tracks of your own go with a video"):
+        reconstruct(shot.images, camera=shot.camera, depth=None, tracks=tracks, unordered=True)
+    (tmp_path / "tracks.txt").write_text("no tracks")
+    command = [
+        "reconstruct",
+        str(tmp_path),
+        "--tracks",
+        str(tmp_path / "tracks.txt"),
+        "--output",
+        str(tmp_path / "out"),
+    ]
+    assert main(command) == 2
+    assert_error(capsys.readouterr(), "tracks.txt: neither a table")
