@@ -51,12 +51,10 @@ function sortRows(key) {
   }
 }
 
-const quoted = text => /^[\w./:@%+=][\w./:@%+=-]*$/.test(text) ? text : `'${text.replaceAll("'", "'\\''")}'`;
-
 function showCommand() {
   const numbers = [...list.chosen].map(row => data.listed.number[row]).sort((a, b) => a - b);
   byId("mend_command").value = numbers.length
-    ? `factorsfm solve ${quoted(data.folder)} --without-tracks ${numbers.join(" ")} --output ${quoted(data.folder + "-mended")}`
+    ? `factorsfm solve ${shellWord(resultFolder())} --without-tracks ${numbers.join(" ")} --output ${shellWord(resultFolder() + "-mended")}`
     : "";
   byId("mend_copy").disabled = byId("mend_none").disabled = !numbers.length;
   byId("mend_copy").textContent = "Copy";
