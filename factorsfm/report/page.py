@@ -27,11 +27,11 @@ _SCRIPTS = ("base.js", "view.js", "footage.js", "align.js", "tracks.js", "charts
 _LIBRARIES = ("gtsam", "pycolmap", "opencv-python-headless", "onnxruntime", "numpy")
 
 
-def report_html(reconstruction: Reconstruction, folder: str | None = None) -> str:
+def report_html(reconstruction: Reconstruction, *, can_be_mended: bool = False) -> str:
     """The report as one HTML document that contains all styles, scripts and data.
 
     Args:
-        folder: of the result, as the user calls it, where the shot can be solved again from it.
+        can_be_mended: whether the shot can be solved again from the folder in which the page lies.
     """
     return _document(
         grade=verdict_of(reconstruction).grade,
@@ -42,7 +42,7 @@ def report_html(reconstruction: Reconstruction, folder: str | None = None) -> st
         frames=reconstruction.frames,
         seconds=reconstruction.seconds,
         options=reconstruction.options,
-        data={**reconstruction_data(reconstruction), "folder": folder},
+        data={**reconstruction_data(reconstruction), "canBeMended": can_be_mended},
     )
 
 

@@ -49,14 +49,13 @@ def write_folder(reconstruction: Reconstruction, directory: str | Path) -> None:
         InputError: the directory cannot be written, or holds something else than an earlier result.
     """
     with _complete_or_nothing(Path(directory)) as folder:
-        _write_files(reconstruction, folder, directory)
+        _write_files(reconstruction, folder)
         for number, other in enumerate(reconstruction.others, 2):
             (folder / part_name(number)).mkdir()
-            _write_files(other, folder / part_name(number), Path(directory) / part_name(number))
+            _write_files(other, folder / part_name(number))
 
 
-def _write_files(reconstruction: Reconstruction, folder: Path, place: str | Path) -> None:
-    """`place`: where the folder comes to lie."""
+def _write_files(reconstruction: Reconstruction, folder: Path) -> None:
     write_trajectory(reconstruction, folder / "trajectory.tum")
     write_colmap(reconstruction, folder / "colmap")
     write_ply(reconstruction, folder / "points.ply")
@@ -68,8 +67,8 @@ def _write_files(reconstruction: Reconstruction, folder: Path, place: str | Path
         (folder / "moving.json").write_text(content, encoding="utf-8")
     if reconstruction.measured is not None:
         write_tracks(reconstruction.measured, folder / "tracks.npz")
-    again = None if reconstruction.measured is None else str(place)
-    (folder / "report.html").write_text(report_html(reconstruction, again), encoding="utf-8")
+    page = report_html(reconstruction, can_be_mended=reconstruction.measured is not None)
+    (folder / "report.html").write_text(page, encoding="utf-8")
     (folder / _SUMMARY).write_text(json_text(summary(reconstruction)), encoding="utf-8")
 
 

@@ -90,7 +90,7 @@ function trackRow(row) {
   for (const [k, content] of cells.entries()) {
     const cell = document.createElement("td");
     cell.append(content);
-    cell.hidden = k === 0 && data.folder === null;
+    cell.hidden = k === 0 && !data.canBeMended;
     element.append(cell);
   }
   return element;
@@ -100,7 +100,7 @@ function startList() {
   list.rows = data.listed.name.map((_, row) => trackRow(row));
   byId("tracks_rows").append(...list.rows);
   for (const button of document.querySelectorAll("[data-sort]")) button.addEventListener("click", () => sortRows(button.dataset.sort));
-  byId("mend_controls").hidden = byId("mend_column").hidden = data.folder === null;
+  byId("mend_controls").hidden = byId("mend_column").hidden = !data.canBeMended;
   byId("mend_copy").addEventListener("click", copyCommand);
   byId("mend_none").addEventListener("click", () => { for (const row of [...list.chosen]) choose(row, false); });
   byId("mend_command").addEventListener("focus", event => event.target.select());

@@ -171,7 +171,7 @@ def test_tracks_are_sorted_shown_and_left_out_by_the_copied_command(report: Repo
     reconstruction = with_thumbnails(build())
     wrong = np.isin(reconstruction.observation_point, [7, 31])
     reconstruction.observation_error = np.where(wrong, 5.0 + reconstruction.observation_error, 0.2)
-    report.open(report_html(reconstruction, "shots/it's here"))
+    report.open(report_html(reconstruction, can_be_mended=True))
     first = "[...byId('tracks_rows').rows].slice(0, 2).map(row => row.cells[1].textContent)"
     assert report.run(first) == ["track_00108", "track_00132"]
     plain = {canvas: report.digest(canvas) for canvas in ("footage", "pointed")}
@@ -187,7 +187,7 @@ def test_tracks_are_sorted_shown_and_left_out_by_the_copied_command(report: Repo
     command = report.run("byId('mend_command').value")
     assert shlex.split(command)[:2] == ["factorsfm", "solve"]
     assert shlex.split(command)[2:] == [
-        "shots/it's here", "--without-tracks", "108", "132", "--output", "shots/it's here-mended",
+        str(report.page.parent), "--without-tracks", "108", "132", "--output", f"{report.page.parent}-mended",
     ]  # fmt: skip
     copied = "new Promise(done => setInterval(() => byId('mend_copy').textContent === 'Copied' && done(true), 10))"
     assert report.run(f"byId('mend_copy').click(); {copied}")
