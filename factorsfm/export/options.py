@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
+from factorsfm.priors.masks import MaskPrior
 from factorsfm.support.errors import InputError
 
 # Values that every format can hold; a value outside has probably another unit.
@@ -41,6 +42,9 @@ class ExportOptions:
             exists. It may have another size than what was solved, such as the originals of proxies, with the same
             aspect ratio: the lens is scaled. A sequence that has all numbers of a numbered source goes with it by the
             numbers, every other footage frame by frame from the first one on.
+        undistorted: of the formats for training (COLMAP, nerfstudio): whether images are written without distortion,
+            with pinhole cameras. COLMAP's formats are a model alone without it, and a whole folder with it.
+        masks: of the same formats: what trainers are to ignore besides what moves by itself, as `open_masks` takes it.
 
     Raises:
         InputError: a value is out of range, or the footage does not exist.
@@ -52,6 +56,8 @@ class ExportOptions:
     up_axis: UpAxis | str | None = None
     scale: float | None = None
     footage: str | Path | None = None
+    undistorted: bool = False
+    masks: str | Path | MaskPrior | None = None
 
     def __post_init__(self) -> None:
         for name, (low, high, unit) in _RANGES.items():

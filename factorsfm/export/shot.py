@@ -16,6 +16,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from factorsfm.camera.undistortion import distorts
 from factorsfm.export.moving import MovingNull, moving_nulls
 from factorsfm.export.options import ExportOptions, UpAxis
 from factorsfm.export.other_footage import Numbering, at_size_of, match_numbers
@@ -31,8 +32,6 @@ _TURNED_WORLD = {  # exported world from the reconstruction's
     UpAxis.Z: np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
 }
 _FILM_CAMERA = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV camera axes from film camera axes
-# Models that equal a pinhole if all parameters besides focal length and principal point are 0.
-_PINHOLE_IF_ZERO = frozenset({"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"})
 _DEFAULT_FPS = 24.0
 _FRAME_RATES = (24000 / 1001, 24.0, 25.0, 30000 / 1001, 30.0, 48.0, 50.0, 60000 / 1001, 60.0)
 
@@ -212,8 +211,7 @@ class Shot:
     @property
     def distorts(self) -> bool:
         """Whether the lens has distortion."""
-        camera = self.reconstruction.camera
-        return camera.model_name not in _PINHOLE_IF_ZERO or bool(np.any(camera.params[camera.extra_params_idxs()]))
+        return distorts(self.reconstruction.camera)
 
     @property
     def clipping(self) -> tuple[float, float]:
