@@ -10,8 +10,10 @@ from factorsfm.export.after_effects import write_after_effects
 from factorsfm.export.alembic import write_alembic
 from factorsfm.export.blender import write_blender
 from factorsfm.export.colmap import write_colmap, write_colmap_binary, write_colmap_training
+from factorsfm.export.lens import write_lens
 from factorsfm.export.nerfstudio import write_nerfstudio
 from factorsfm.export.nuke import write_chan, write_nuke
+from factorsfm.export.opentrackio import write_opentrackio
 from factorsfm.export.options import ExportOptions, UpAxis
 from factorsfm.export.ply import write_ply
 from factorsfm.export.shot import Defaults, Shot, make_shot
@@ -100,6 +102,14 @@ FORMATS = {
     "usd": Format("USD stage", write_usd, defaults=Defaults(UpAxis.Y, scale=100.0, first_frame=1001)),
     "alembic": Format("Alembic archive", write_alembic, defaults=Defaults(UpAxis.Y, first_frame=1001)),
     "stmap": Format("maps that undistort and distort, 32-bit EXR", write_stmaps, is_folder=True),
+    "lens": Format(
+        "the lens for Nuke, Blender and 3DEqualizer, with its deviation in each", write_lens, is_folder=True
+    ),
+    "opentrackio": Format(
+        "samples of camera and lens in OpenTrackIO",
+        write_opentrackio,
+        defaults=Defaults(UpAxis.Z, first_frame=1001),
+    ),
     "undistorted": Format(
         "the footage without distortion", write_undistorted, is_folder=True, defaults=Defaults(first_frame=1001)
     ),

@@ -87,7 +87,7 @@ def report_chan(path):
     bpy.context.view_layer.objects.active = camera
     camera.rotation_mode = "QUATERNION"
     bpy.ops.import_scene.import_chan(
-        filepath=path, z_up=False, rotation_order="ZXY", sensor_width=36.0, sensor_height=36.0 * 480 / 640 * 600 / 640
+        filepath=path, z_up=False, rotation_order="ZXY", sensor_width=36.0, sensor_height=36.0 * 480 / 640 * 600 / 1200
     )
     scene = bpy.context.scene
     keys = sorted({key.co[0] for curve in camera.animation_data.action.fcurves for key in curve.keyframe_points})
@@ -117,7 +117,27 @@ def report_exr(path):
     }
 
 
-script, chan, obj, exr, output = sys.argv[sys.argv.index("--") + 1 :]
+def report_lens(path, exr):
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    clip = bpy.data.movieclips.load(exr)
+    runpy.run_path(path)
+    camera = clip.tracking.camera
+    names = (
+        "distortion_model",
+        "sensor_width",
+        "pixel_aspect",
+        "focal_length",
+        "focal_length_pixels",
+        "k1",
+        "k2",
+        "k3",
+    )
+    center = camera.principal_point_pixels if hasattr(camera, "principal_point_pixels") else camera.principal
+    return {**{name: getattr(camera, name) for name in names}, "center": list(center)}
+
+
+script, chan, obj, exr, lens, output = sys.argv[sys.argv.index("--") + 1 :]
 found = {"scene": report_scene(script), "chan": report_chan(chan), "obj": report_obj(obj), "exr": report_exr(exr)}
+found["lens"] = report_lens(lens, exr)
 with open(output, "w", encoding="utf-8") as file:
     json.dump(found, file)

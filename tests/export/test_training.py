@@ -17,11 +17,12 @@ from factorsfm.result.moving import Moving, MovingStretch
 from factorsfm.result.reconstruction import Reconstruction, RollingShutter
 from factorsfm.support.errors import InputError
 from tests.exact_result import build
-from tests.export_problems import PARAMS, noise_images
+from tests.export_problems import noise_images
 
 Array = NDArray[np.float64]
 
-COLORS = np.array([[x, y, 4.5 + x * y] for x in (-1.2, -0.4, 0.4, 1.2) for y in (-0.9, 0.0, 0.9)])
+PARAMS = [600.0, 640.0, 290.0, 262.0, 0.06, -0.03, 0.002, -0.001]
+POINTS = np.array([[x, y, 4.5 + x * y] for x in (-1.2, -0.4, 0.4, 1.2) for y in (-0.9, 0.0, 0.9)])
 MOVING = np.array([540.0, 330.0])  # pixels of the footage, in frame 10; it goes left, away from all blobs
 FOUND_PX = 0.1  # the middle of a blob after interpolation
 NONE = cv2.IMREAD_UNCHANGED
@@ -44,14 +45,14 @@ def middle(image: NDArray[np.uint8], place: Array) -> Array:
 
 def stained(folder: Path, suffix: str = ".jpg") -> Reconstruction:
     """A result of a lens with distortion and pixels that are not square, and its footage; something moves."""
-    result = build(frames=5, points=len(COLORS), unregistered=(3,))
+    result = build(frames=5, points=len(POINTS), unregistered=(3,))
     camera = pycolmap.Camera(model="OPENCV", width=640, height=480, params=PARAMS)
     folder.mkdir()
     frames, seen = [], []
     for frame in result.frames:
         frames.append(replace(frame, name=f"shot.{frame.index:04d}{suffix}"))
         pose = frame.cam_from_world or pycolmap.Rigid3d()
-        seen.append(camera.img_from_cam(pose * COLORS) - 0.5)
+        seen.append(camera.img_from_cam(pose * POINTS) - 0.5)
         cv2.imwrite(str(folder / frames[-1].name), blobs(seen[-1], (640, 480)), [cv2.IMWRITE_JPEG_QUALITY, 100])
     xy = np.concatenate([MOVING + np.random.default_rng(k).uniform(-20, 20, (30, 2)) - [5 * k, 0] for k in range(5)])
     moving = Moving(
@@ -59,7 +60,7 @@ def stained(folder: Path, suffix: str = ".jpg") -> Reconstruction:
     )
     options = {"source": str(folder), "first_number": 10}
     return replace(
-        result, camera=camera, frames=frames, points=COLORS, observation_xy=np.concatenate(seen), moving=moving,
+        result, camera=camera, frames=frames, points=POINTS, observation_xy=np.concatenate(seen), moving=moving,
         options=options,
     )  # fmt: skip
 
@@ -87,11 +88,11 @@ def test_colmap_folder_has_what_its_cameras_see(shot: Reconstruction, tmp_path: 
     names = {image.name for image in model.images.values()}
     assert names == {frame.name for frame in shot.registered}
     assert {path.name for path in (tmp_path / "out" / "images").iterdir()} == names
-    assert model.num_points3D() == len(COLORS)
+    assert model.num_points3D() == len(POINTS)
     for image in model.images.values():
         pixels = cv2.imread(str(tmp_path / "out" / "images" / image.name), NONE)
         assert pixels.shape == (camera.height, camera.width, 3)
-        seen = camera.img_from_cam(image.cam_from_world() * COLORS)
+        seen = camera.img_from_cam(image.cam_from_world() * POINTS)
         np.testing.assert_allclose([p.xy for p in image.points2D], seen, atol=1e-5)
         for place in seen - 0.5:
             assert np.abs(middle(pixels, place) - place).max() < FOUND_PX
@@ -111,7 +112,7 @@ def test_nerfstudio_has_a_mask_for_every_image(shot: Reconstruction, tmp_path: P
     lens = np.array([[content["fl_x"], 0, content["cx"]], [0, content["fl_y"], content["cy"]], [0, 0, 1]])
     bent = np.array([content[name] for name in ("k1", "k2", "p1", "p2")])
     assert bent.any() != undistorted
-    ply = np.frombuffer((tmp_path / "out" / "points.ply").read_bytes()[-15 * len(COLORS) :], "V15")
+    ply = np.frombuffer((tmp_path / "out" / "points.ply").read_bytes()[-15 * len(POINTS) :], "V15")
     points = np.array([np.frombuffer(row, "<f4", 3) for row in ply])
     for entry in content["frames"]:
         pixels = cv2.imread(str(tmp_path / "out" / entry["file_path"]), NONE)
