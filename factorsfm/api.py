@@ -12,11 +12,12 @@ from typing import get_args
 import pycolmap
 
 from factorsfm.camera.files import open_camera
-from factorsfm.control.known import Control, read_control
+from factorsfm.control.files import read_control
+from factorsfm.control.known import Control
 from factorsfm.frames.edits import AnotherView, LeftOut, left_out_of, read_edit, until_another_view
 from factorsfm.frames.fields import Fields
 from factorsfm.frames.frame import Frame
-from factorsfm.frames.numbering import missing_numbers, sequence_of
+from factorsfm.frames.numbering import first_number_of, missing_numbers, sequence_of
 from factorsfm.frames.ranges import checked_range
 from factorsfm.frames.reading import check_footage
 from factorsfm.frames.unordered import looks_unordered, other_files, read_images
@@ -86,8 +87,8 @@ def reconstruct(
         features: of a set: "sift"; "xfeat", whose networks lie in the folder that ``FACTORSFM_MODELS`` names; or a
             folder that holds them.
         work: folder for the features and matches of a set, from which an interrupted run goes on; None keeps nothing.
-        control: what is known beforehand of poses, points, distances and heights, or its JSON file; the result is in
-            the world and unit of the control then.
+        control: what is known beforehand of poses, points, distances and heights, or its file (`read_control`), also
+            of a camera that another program has tracked; the result is in the world and unit of the control then.
         imu: recording of an IMU on the camera of a video, or its file (`open_imu`); the result is metric then.
         progress: called with the stage, the frames done, and their number where it is known.
 
@@ -115,7 +116,7 @@ def reconstruct(
         masks=open_masks(masks),
         objects=None if from_motion else open_objects(objects),
         from_motion=from_motion,
-        control=read_control(control) if isinstance(control, str | Path) else control,
+        control=read_control(control, first_number_of(source)) if isinstance(control, str | Path) else control,
         imu=open_imu(imu) if isinstance(imu, str | Path) else imu,
         features=features,
         work=work,

@@ -10,9 +10,10 @@ from factorsfm.cli.command import Command, add_shot
 from factorsfm.cli.progress_line import ProgressLine
 from factorsfm.export.formats import FORMATS, export
 from factorsfm.export.how_to_train import how_to_train
-from factorsfm.export.options import ExportOptions, UpAxis
+from factorsfm.export.options import ExportOptions
 from factorsfm.frames.timing import are_uneven
 from factorsfm.result.reading import read_result
+from factorsfm.support.up_axis import UpAxis
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

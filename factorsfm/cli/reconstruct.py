@@ -50,8 +50,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--control",
         type=Path,
-        metavar="FILE.json",
-        help="known poses, points, distances and heights: the result is in their world and unit",
+        metavar="FILE",
+        help="known poses, points, distances and heights (JSON), or the camera of another program (.chan, USD, "
+        "Alembic, transforms.json, COLMAP's folder): the result is in their world and unit",
     )
     parser.add_argument(
         "--align", action="store_true", help="the result stands on its ground, as factorsfm align makes it"

@@ -14,7 +14,7 @@ from factorsfm.export.lens import write_lens
 from factorsfm.export.nerfstudio import write_nerfstudio
 from factorsfm.export.nuke import write_chan, write_nuke
 from factorsfm.export.opentrackio import write_opentrackio
-from factorsfm.export.options import ExportOptions, UpAxis
+from factorsfm.export.options import ExportOptions
 from factorsfm.export.ply import write_ply
 from factorsfm.export.shot import Defaults, Shot, make_shot
 from factorsfm.export.stmap import write_stmaps, write_undistorted
@@ -31,6 +31,7 @@ from factorsfm.export.writing import complete_file, complete_folder
 from factorsfm.result.reconstruction import Reconstruction
 from factorsfm.support.errors import InputError
 from factorsfm.support.file_names import check_name
+from factorsfm.support.up_axis import UpAxis
 
 _AS_RECONSTRUCTED = Defaults()
 

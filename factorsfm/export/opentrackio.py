@@ -14,10 +14,10 @@ import numpy as np
 import pycolmap
 
 from factorsfm.camera.openlensio import distortion_of
-from factorsfm.export.options import UpAxis
 from factorsfm.export.rotation import angles_zxy
 from factorsfm.export.shot import Lens, Shot
 from factorsfm.support.errors import InputError
+from factorsfm.support.up_axis import UpAxis
 
 logger = logging.getLogger(__name__)
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import StrEnum
 from pathlib import Path
 
 from factorsfm.priors.masks import MaskPrior
 from factorsfm.support.errors import InputError
+from factorsfm.support.up_axis import UpAxis
 
 # Values that every format can hold; a value outside has probably another unit.
 _RANGES: dict[str, tuple[float, float, str]] = {
@@ -16,14 +16,6 @@ _RANGES: dict[str, tuple[float, float, str]] = {
     "sensor_width": (1e-3, 1e6, "millimetres"),
     "scale": (1e-9, 1e9, "a length"),
 }
-
-
-class UpAxis(StrEnum):
-    """The world axis that points up in the first frame; the world is right-handed and its x axis points right."""
-
-    Y = "y"  # x right, y up, z towards the viewer: Nuke, USD, Alembic
-    Z = "z"  # x right, y into the picture, z up: Blender, nerfstudio
-    MINUS_Y = "-y"  # x right, y down, z into the picture: OpenCV, COLMAP, After Effects, the reconstruction itself
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

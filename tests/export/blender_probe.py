@@ -6,6 +6,7 @@ Its arguments, after ``--``: the exported .py, a .chan file, an .obj file, an .e
 import json
 import runpy
 import sys
+import tempfile
 
 import addon_utils
 import bpy
@@ -76,6 +77,11 @@ def report_scene(script):
             scene.frame_set(frame)
             files[frame] = behind.image.filepath_from_user(image_user=behind.image_user)
         report["background"] = {"source": behind.image.source, "size": list(behind.image.size), "files": files}
+    addon_utils.enable("io_anim_nuke_chan")
+    bpy.context.view_layer.objects.active = camera
+    with tempfile.NamedTemporaryFile(suffix=".chan") as file:
+        bpy.ops.export.export_chan(filepath=file.name, rotation_order="ZXY")
+        report["written_chan"] = file.read().decode()
     return report
 
 

@@ -9,11 +9,13 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 from numpy.typing import NDArray
 
 from factorsfm.camera.other_models import distorting
 from factorsfm.camera.projection import with_focal
+from factorsfm.control.files import read_control
 from factorsfm.export import ExportOptions, export
 from factorsfm.result.reconstruction import Reconstruction
 from tests.export_problems import (
@@ -170,3 +172,14 @@ def test_blender_s_movie_clip_has_the_lens(report: dict[str, Any]) -> None:
     np.testing.assert_allclose(lens["center"], [290, 480 - 262], atol=1e-3)
     fitted = distorting(hard_reconstruction().camera, 3, 1.0).coefficients
     assert [lens["k1"], lens["k2"], lens["k3"]] == pytest.approx(fitted, rel=1e-5)
+
+
+def test_what_blender_writes_as_chan_comes_back_as_control(report: dict[str, Any], tmp_path: Path) -> None:
+    (tmp_path / "a.chan").write_text(report["scene"]["written_chan"])
+    found = {pose.frame: pose for pose in read_control(tmp_path / "a.chan").poses}
+    reconstruction = hard_reconstruction()
+    for frame, center in zip(reconstruction.registered, reconstruction.camera_centers(), strict=True):
+        pose = found[frame.index]
+        np.testing.assert_allclose(np.asarray(pose.position) / SCALE, center, atol=1e-5)
+        turn = pycolmap.Rotation3d(np.asarray(pose.cam_from_world)) * frame.cam_from_world.rotation.inverse()
+        assert np.degrees(turn.angle()) < 1e-3
