@@ -30,6 +30,7 @@ _POWERS = (2, 4, 6)  # of the radius
 _BROWN = frozenset({"SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"})
 _TOLD_SHARE = 1e-4  # of the image width, 0.2 pixels of 1920: a deviation that is worth a word
 _SAME_MM = 1e-6
+_LARGEST_MM, _LARGEST = 1e6, 1e12  # of lengths and coefficients: the powers of both stay finite
 
 
 def distortion_of(camera: pycolmap.Camera, focal_mm: float) -> tuple[dict[str, Any] | None, float]:
@@ -124,11 +125,15 @@ def content_of_sample(sample: Mapping[str, Any]) -> dict[str, Any]:
             f"anamorphicSqueeze is {squeeze.num}/{squeeze.denom}; 1 is expected, with the squeeze in the sensor's size"
         )
     sensor, pixels = camera.activeSensorPhysicalDimensions, camera.activeSensorResolution
-    for name, value in (("sensor width", sensor.width), ("sensor height", sensor.height), ("width", pixels.width)):
-        if not value > 0:
-            raise InputError(f"the {name} is {value:g}; a positive number is expected")
+    for name, value in (
+        ("sensor width", sensor.width), ("sensor height", sensor.height), ("focal length", lens.pinholeFocalLength),
+    ):  # fmt: skip
+        if not 1 / _LARGEST_MM <= value <= _LARGEST_MM:
+            raise InputError(f"the {name} is {value:g}; mm from {1 / _LARGEST_MM:g} to {_LARGEST_MM:g} are expected")
     scale = np.array([pixels.width / sensor.width, pixels.height / sensor.height])
     offset = lens.projectionOffset
+    if not max(abs(offset.x), abs(offset.y)) <= _LARGEST_MM:
+        raise InputError(f"projectionOffset is {offset.x:g}, {offset.y:g}; mm up to {_LARGEST_MM:g} are expected")
     focal = lens.pinholeFocalLength * scale
     center = np.array([pixels.width, pixels.height]) / 2 + np.array([offset.x, offset.y]) * scale - 0.5
     chosen = next((one for one in lens.distortion if one.model == _UD), next(iter(lens.distortion), None))
@@ -153,6 +158,8 @@ def _coefficients(given: _Distortion, focal_mm: float, sensor: _Size) -> list[fl
             f"the distortion has {len(given.radial)} radial and {len(given.tangential)} tangential coefficients; "
             "at most 6 and 2 are expected"
         )
+    if not all(abs(k) <= _LARGEST for k in (*given.radial, *given.tangential)):
+        raise InputError(f"a distortion coefficient is not a number up to {_LARGEST:g}")
     radial = np.array([*given.radial, *(0.0,) * (6 - len(given.radial))]).reshape(3, 2)
     radial *= (focal_mm ** np.array(_POWERS))[:, None]
     tangential = np.array([*given.tangential, *(0.0,) * (2 - len(given.tangential))]) * focal_mm
@@ -171,8 +178,11 @@ def _inverted(radial: Array, tangential: Array, corner: Array) -> tuple[Array, A
     grid = np.stack(np.meshgrid(*(np.linspace(-end, end, 41) for end in corner)), axis=-1).reshape(-1, 2)
     square = (grid**2).sum(axis=1)
     powers = square[:, None] ** np.arange(1, 4)
-    straight = grid * ((1 + powers @ radial[:, 0]) / (1 + powers @ radial[:, 1]))[:, None]
+    below = 1 + powers @ radial[:, 1]
+    straight = grid * ((1 + powers @ radial[:, 0]) / np.where(below, below, np.nan))[:, None]
     straight += _tangential(grid) @ tangential
+    if not np.abs(straight).max() <= _LARGEST_MM:
+        raise InputError("the distortion leaves the image")
     powers = (straight**2).sum(axis=1)[:, None] ** np.arange(1, 4)
     columns = np.concatenate([straight[:, :, None] * powers[:, None], _tangential(straight)], axis=2)
     found = np.linalg.lstsq(columns.reshape(-1, 5), (grid - straight).ravel(), rcond=None)[0]

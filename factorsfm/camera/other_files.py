@@ -121,9 +121,7 @@ def _arrays(storage: cv2.FileStorage, names: tuple[str, ...]) -> Iterator[Array]
         node = storage.getNode(name)
         if node.isMap():
             values = node.getNode("data")
-            if node.getNode("dt").isString():
-                yield np.asarray(node.mat(), np.float64)
-            elif values.isSeq():
+            if values.isSeq():  # not node.mat(), which asserts that the sizes are right
                 yield np.array([values.at(k).real() for k in range(values.size())])
 
 

@@ -184,7 +184,8 @@ class Control:
     def __post_init__(self) -> None:
         names = [point.name for point in self.points]
         for what, keys in (("frame", [str(pose.frame) for pose in self.poses]), ("point", names)):
-            twice = [key for key, count in Counter(keys).items() if count > 1]
+            counts = Counter(map(repr, keys))
+            twice = [key for key in keys if counts[repr(key)] > 1]
             if twice:
                 raise InputError(f'{what} "{twice[0]}" is there twice')
         for name in (*(n for d in self.distances for n in d.points), *(n for h in self.heights for n in h.above)):

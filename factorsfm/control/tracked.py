@@ -25,6 +25,7 @@ Array = NDArray[np.float64]
 Poses = dict[str | int, Array]  # (4, 4) camera to world in OpenCV's axes, by name or number of the frame
 
 _COLMAP = ("images.bin", "images.txt")
+_LARGEST = 1e12  # of a number: its square stays finite
 _STILL = 1e-9  # of a number: a camera whose positions differ by less does not move
 
 
@@ -81,8 +82,8 @@ def read_tracked(path: Path, fps: float | None = None) -> TrackedCamera:
     if not tracked.poses:
         raise InputError("it holds no pose of a camera")
     values = np.array(list(tracked.poses.values()))
-    if not np.isfinite(values).all():
-        raise InputError("a pose in it is not finite")
+    if not (np.abs(values) <= _LARGEST).all():
+        raise InputError(f"a pose in it is not finite, or beyond {_LARGEST:g}")
     if tracked.extent <= _STILL * max(1.0, np.abs(values[:, :3, 3]).max()):
         raise InputError("its camera stands still, which gives a scene no size; positions that differ are expected")
     return tracked
@@ -96,29 +97,32 @@ def _opencv(world_from_film: Array, up: UpAxis, scale: float = 1.0) -> Array:
     """
     world = np.eye(4)
     world[:3, :3] = TURNED_WORLD[up].T
-    found = world @ world_from_film @ FILM_CAMERA
-    found[..., :3, 3] *= scale
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused with the poses
+        found = world @ world_from_film @ FILM_CAMERA
+        found[..., :3, 3] *= scale
     return np.asarray(found)
 
 
 def _chan(path: Path) -> Poses:
     """Lines of ``frame tx ty tz rx ry rz``, degrees; rotation about z, then x, then y; further columns are ignored."""
-    found: Poses = {}
     try:
-        for line in path.read_text(encoding="utf-8-sig").splitlines():
-            if not line.strip() or line.lstrip().startswith("#"):
-                continue
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, ValueError) as error:
+        raise InputError(f"it cannot be read: {getattr(error, 'strerror', None) or 'it is no text'}") from error
+    found: Poses = {}
+    for line in text.splitlines():
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        try:
             number, *place = (float(word) for word in line.split()[:7])
             if len(place) != 6 or number != round(number):
                 raise ValueError
-            x, y, z = (cv2.Rodrigues(np.radians(a) * axis)[0] for a, axis in zip(place[3:], np.eye(3), strict=True))
-            matrix = np.eye(4)
-            matrix[:3, :3], matrix[:3, 3] = y @ x @ z, place[:3]
-            found[round(number)] = _opencv(matrix, UpAxis.Y)
-    except ValueError as error:
-        raise InputError(f'the line "{line[:60]}" is not "frame tx ty tz rx ry rz" in numbers') from error
-    except OSError as error:
-        raise InputError(f"it cannot be read: {error.strerror or error}") from error
+        except (ValueError, OverflowError) as error:
+            raise InputError(f'the line "{line[:60]}" is not "frame tx ty tz rx ry rz" in numbers') from error
+        x, y, z = (cv2.Rodrigues(np.radians(a) * axis)[0] for a, axis in zip(place[3:], np.eye(3), strict=True))
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = y @ x @ z, place[:3]
+        found[round(number)] = _opencv(matrix, UpAxis.Y)
     return found
 
 
