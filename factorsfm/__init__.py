@@ -9,9 +9,10 @@ from factorsfm.alignment.picks import Pick
 from factorsfm.api import reconstruct
 from factorsfm.camera.files import read_camera
 from factorsfm.camera.guess import guess_camera
+from factorsfm.control.files import read_control
 from factorsfm.control.fit import ControlFit, ControlResidual
-from factorsfm.control.known import Control, KnownDistance, KnownHeight, KnownPose, MarkedPoint, read_control
-from factorsfm.export.options import ExportOptions, UpAxis
+from factorsfm.control.known import Control, KnownDistance, KnownHeight, KnownPose, MarkedPoint
+from factorsfm.export.options import ExportOptions
 from factorsfm.frames.cuts import CutDetector, ShotUpdate
 from factorsfm.frames.edits import find_shots
 from factorsfm.frames.frame import Frame
@@ -45,6 +46,7 @@ from factorsfm.streaming.stream import Stream
 from factorsfm.support.errors import FactorsfmError, InputError, ModelError, ReconstructionError
 from factorsfm.support.options import PRESETS, MapperOptions, Options, PolishOptions, TrackerOptions
 from factorsfm.support.status import FrameStatus, ShotKind
+from factorsfm.support.up_axis import UpAxis
 
 logging.getLogger(__name__).addHandler(logging.NullHandler())
 

@@ -12,11 +12,12 @@ from typing import get_args
 import pycolmap
 
 from factorsfm.camera.files import open_camera
-from factorsfm.control.known import Control, read_control
+from factorsfm.control.files import read_control
+from factorsfm.control.known import Control
 from factorsfm.frames.edits import AnotherView, LeftOut, left_out_of, read_edit, until_another_view
 from factorsfm.frames.fields import Fields
 from factorsfm.frames.frame import Frame
-from factorsfm.frames.numbering import missing_numbers, sequence_of
+from factorsfm.frames.numbering import first_number_of, missing_numbers, sequence_of
 from factorsfm.frames.ranges import checked_range
 from factorsfm.frames.reading import check_footage
 from factorsfm.frames.unordered import looks_unordered, other_files, read_images
@@ -88,8 +89,8 @@ def reconstruct(
         features: of a set: "sift"; "xfeat", whose networks lie in the folder that ``FACTORSFM_MODELS`` names; or a
             folder that holds them.
         work: folder for the features and matches of a set, from which an interrupted run goes on; None keeps nothing.
-        control: what is known beforehand of poses, points, distances and heights, or its JSON file; the result is in
-            the world and unit of the control then.
+        control: what is known beforehand of poses, points, distances and heights, or its file (`read_control`), also
+            of a camera that another program has tracked; the result is in the world and unit of the control then.
         tracks: of the user in a video, which take part with a weight of their own and become named points; or their
             file (`read_tracks`).
         imu: recording of an IMU on the camera of a video, or its file (`open_imu`); the result is metric then.
@@ -108,6 +109,7 @@ def reconstruct(
         unordered = isinstance(source, str | Path) and looks_unordered(Path(source), frames)
     options = replace(Options.preset_named(preset), lens=lens, shutter=shutter)
     from_motion = isinstance(objects, str) and objects == FROM_MOTION
+    number = first_number_of(source)
     given = Inputs(
         source=source,
         frames=frames,
@@ -119,8 +121,8 @@ def reconstruct(
         masks=open_masks(masks),
         objects=None if from_motion else open_objects(objects),
         from_motion=from_motion,
-        control=read_control(control) if isinstance(control, str | Path) else control,
-        tracks=_read_tracks(tracks, source) if isinstance(tracks, str | Path) else tracks,
+        control=read_control(control, number) if isinstance(control, str | Path) else control,
+        tracks=read_tracks(tracks, first_number=number) if isinstance(tracks, str | Path) else tracks,
         imu=open_imu(imu) if isinstance(imu, str | Path) else imu,
         features=features,
         work=work,
@@ -132,11 +134,6 @@ def reconstruct(
         part.seconds["total"] = time.perf_counter() - begin
         part.options |= said
     return result
-
-
-def _read_tracks(path: str | Path, source: Source) -> UserTracks:
-    numbers = sequence_of(source)
-    return read_tracks(path, first_number=numbers[0] if numbers else None)
 
 
 def _check_choice(name: str, value: str, expected: tuple[str, ...]) -> None:

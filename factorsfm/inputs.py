@@ -15,7 +15,7 @@ from factorsfm.control.known import Control, find_frames
 from factorsfm.frames.fields import Fields
 from factorsfm.frames.folders import list_images
 from factorsfm.frames.frame import Frame
-from factorsfm.frames.numbering import chosen, numbered_images, sequence_of
+from factorsfm.frames.numbering import chosen, first_number_of, numbered_images
 from factorsfm.frames.ranges import checked_range, range_text
 from factorsfm.frames.reading import read_frames
 from factorsfm.inertial.recording import ImuRecording
@@ -121,7 +121,7 @@ def input_options(
     The number that a sequence begins with, the names of the priors, the range, and how footage was read.
     """
     return {
-        "first_number": numbers[0] if (numbers := sequence_of(source)) else None,
+        "first_number": first_number_of(source),
         "depth": depth.name if depth is not None else None,
         "depth_kind": str(depth.kind) if depth is not None else None,
         "masks": _name_of(masks),

@@ -13,7 +13,7 @@ from tests.exact_result import build
 
 Array = NDArray[np.float64]
 
-PARAMS = [600.0, 640.0, 290.0, 262.0, 0.06, -0.03, 0.002, -0.001]
+PARAMS = [600.0, 1200.0, 290.0, 262.0, 0.06, -0.03, 0.002, -0.001]
 
 # (exported world from OpenCV's) for each up axis, written out: x, y, z of the new world in terms of the old one.
 WORLDS = {
@@ -26,7 +26,7 @@ WORLDS = {
 def hard_reconstruction(model: str = "OPENCV", **changes: object) -> Reconstruction:
     """Six frames with the indices 10, 12, ..., 20; the one with index 16 is not registered.
 
-    Large rotations about all axes, an off-centre principal point, fx unlike fy, distortion.
+    Large rotations about all axes, an off-centre principal point, distortion, and anamorphic pixels, 2:1.
     """
     params = {"OPENCV": PARAMS, "PINHOLE": PARAMS[:4]}[model]
     camera = pycolmap.Camera(model=model, width=640, height=480, params=params)
@@ -72,7 +72,7 @@ def seen_points(reconstruction: Reconstruction, position: int) -> tuple[Array, A
     pinhole = pycolmap.Camera(model="PINHOLE", width=camera.width, height=camera.height, params=params)
     rng = np.random.default_rng(position)
     depth = rng.uniform(2, 9, 30)
-    in_camera = np.column_stack([rng.uniform(-0.5, 0.5, (30, 2)) * depth[:, None], depth])
+    in_camera = np.column_stack([rng.uniform(-1, 1, (30, 2)) * [0.5, 0.2] * depth[:, None], depth])
     pose = reconstruction.registered[position].cam_from_world
     return pose.inverse() * in_camera, pinhole.img_from_cam(in_camera)
 

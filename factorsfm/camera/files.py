@@ -1,4 +1,4 @@
-"""Camera files: JSON with the names of OpenCV or COLMAP."""
+"""Camera files: JSON with the names of OpenCV or COLMAP, and lens files of other programs."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from factorsfm.camera.other_files import content_of
 from factorsfm.camera.projection import PIXEL_CENTER
 from factorsfm.support.errors import InputError
-from factorsfm.support.json_reading import read_json
 
 # Smallest and largest focal length over the longer image side; one outside has the wrong unit, such as millimetres.
 # A 2,000 mm lens on Super 35 film has a ratio of 80.
@@ -31,20 +31,21 @@ _TWO_FOCAL_LENGTHS = {
 
 
 def read_camera(path: str | Path) -> pycolmap.Camera:
-    """Read a camera from a JSON file.
+    """Read a camera from a JSON file, or from a lens file of another program.
 
-    The file holds ``width, height, fx, fy, cx, cy`` in pixels (a PINHOLE camera), or ``width, height`` and
+    The JSON file holds ``width, height, fx, fy, cx, cy`` in pixels (a PINHOLE camera), or ``width, height`` and
     ``model, params`` with the names and the order of COLMAP. Pixel centres are at integers in both forms. Further keys
-    are ignored.
+    are ignored. Other files are OpenCV's YAML or XML of a calibration, COLMAP's ``cameras.txt``, and samples of
+    OpenTrackIO.
 
     Raises:
-        InputError: the file cannot be read or is not JSON, a key is missing, or a value is out of range.
+        InputError: the file cannot be read, a key is missing, or a value is out of range.
     """
     path = Path(path)
-    content = read_json(path, "camera file")
-    if not isinstance(content, dict):
-        raise InputError(f"camera file {path} holds a {type(content).__name__}; a JSON object is expected")
     try:
+        content = content_of(path)
+        if not isinstance(content, dict):
+            raise InputError(f"it holds a {type(content).__name__}; a JSON object is expected")
         return camera_from_json(content)
     except InputError as error:
         raise InputError(f"camera file {path}: {error}") from error

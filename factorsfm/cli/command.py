@@ -51,7 +51,11 @@ def add_output(parser: argparse.ArgumentParser, help_: str = RESULT_FOLDER) -> N
 def add_method(parser: argparse.ArgumentParser) -> None:
     """Declare lens, prior, masks and preset."""
     parser.add_argument(
-        "--camera", type=Path, metavar="FILE.json", help="width, height, fx, fy, cx, cy; default: estimated"
+        "--camera",
+        type=Path,
+        metavar="FILE",
+        help="the lens: JSON with width, height, fx, fy, cx, cy, or a file of OpenCV, COLMAP or OpenTrackIO; default: "
+        "estimated",
     )
     parser.add_argument(
         "--depth",

@@ -9,9 +9,11 @@ from pathlib import Path
 from factorsfm.cli.command import Command, add_shot
 from factorsfm.cli.progress_line import ProgressLine
 from factorsfm.export.formats import FORMATS, export
-from factorsfm.export.options import ExportOptions, UpAxis
+from factorsfm.export.how_to_train import how_to_train
+from factorsfm.export.options import ExportOptions
 from factorsfm.frames.timing import are_uneven
 from factorsfm.result.reading import read_result
+from factorsfm.support.up_axis import UpAxis
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,6 +38,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--scale", type=float, help="exported length of one unit (default: the format's)")
     add_shot(parser)
+    parser.add_argument(
+        "--undistorted",
+        action="store_true",
+        help="for training (colmap, nerfstudio): images without distortion, and pinhole cameras",
+    )
+    parser.add_argument(
+        "--masks",
+        metavar="FOLDER|people|movable|MODEL.onnx",
+        help="for training: what is ignored besides what moves by itself, as reconstruct takes it",
+    )
 
 
 def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
@@ -49,7 +61,10 @@ def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
     times = [frame.timestamp for frame in reconstruction.frames]
     uneven = arguments.format != "tum" and are_uneven([frame.index for frame in reconstruction.frames], times)
     rate = "; its frames come at uneven times, and here each lasts as long as any other" if uneven else ""
-    return f"Wrote {arguments.format} ({FORMATS[arguments.format].description}) to {arguments.output}{without}{rate}."
+    wrote = f"Wrote {arguments.format} ({FORMATS[arguments.format].description}) to {arguments.output}{without}{rate}."
+    if not FORMATS[arguments.format].trains:
+        return wrote
+    return "\n".join([wrote, *how_to_train(reconstruction, arguments.output, arguments.format, options)])
 
 
 def _formats_help() -> str:

@@ -26,7 +26,7 @@ from factorsfm.cli.command import (
     write_result,
 )
 from factorsfm.cli.progress_line import ProgressLine
-from factorsfm.frames.numbering import sequence_of
+from factorsfm.frames.numbering import first_number_of
 from factorsfm.report.result_folder import check_directory, write_failure
 from factorsfm.support.errors import InputError, ReconstructionError
 
@@ -54,8 +54,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--control",
         type=Path,
-        metavar="FILE.json",
-        help="known poses, points, distances and heights: the result is in their world and unit",
+        metavar="FILE",
+        help="known poses, points, distances and heights (JSON), or the camera of another program (.chan, USD, "
+        "Alembic, transforms.json, COLMAP's folder): the result is in their world and unit",
     )
     add_align(parser)
     add_tracks(parser)
@@ -74,8 +75,7 @@ def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
     if arguments.align and arguments.control is not None:
         raise InputError("--align and --control are given; a result in the world of its control is not aligned")
     camera, frames = open_camera(arguments.camera), range_of(arguments)
-    numbers = sequence_of(arguments.source)
-    tracks = tracks_of(arguments, numbers[0] if numbers else None)
+    tracks = tracks_of(arguments, first_number_of(arguments.source))
     begin = time.perf_counter()
     try:
         reconstruction = api.reconstruct(

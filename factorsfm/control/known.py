@@ -6,10 +6,10 @@ with its standard deviation (`sigma`). Frames are named by their name, with or w
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
-from pathlib import Path, PurePath
+from collections import Counter, defaultdict
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import PurePath
 from typing import Any, Protocol
 
 import numpy as np
@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from factorsfm.control.world_alignment import check_enough
 from factorsfm.support.errors import InputError
-from factorsfm.support.json_reading import read_json
 from factorsfm.tracks.image_tracks import ImageTracks
 
 Array = NDArray[np.float64]
@@ -26,7 +25,6 @@ Vector = Sequence[float] | Array
 FrameKey = str | int
 
 _LARGEST = 1e12  # of a number, and of the inverse of one that is not 0: their squares and products stay finite
-_KINDS = ("poses", "points", "distances", "heights")
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,6 +167,9 @@ class KnownHeight:
 class Control:
     """All known poses, points, distances and heights of a scene.
 
+    Attributes:
+        spare: whether poses of frames that the source does not have are left out; else they are an error.
+
     Raises:
         InputError: nothing is known, a frame or a point is there twice, a point that is not there is referred to, or
             the control does not determine where the scene is in its world.
@@ -178,11 +179,13 @@ class Control:
     points: Sequence[MarkedPoint] = ()
     distances: Sequence[KnownDistance] = ()
     heights: Sequence[KnownHeight] = ()
+    spare: bool = False
 
     def __post_init__(self) -> None:
         names = [point.name for point in self.points]
         for what, keys in (("frame", [str(pose.frame) for pose in self.poses]), ("point", names)):
-            twice = [key for key in keys if keys.count(key) > 1]
+            counts = Counter(map(repr, keys))
+            twice = [key for key in keys if counts[repr(key)] > 1]
             if twice:
                 raise InputError(f'{what} "{twice[0]}" is there twice')
         for name in (*(n for d in self.distances for n in d.points), *(n for h in self.heights for n in h.above)):
@@ -205,6 +208,22 @@ class Control:
             any(pose.cam_from_world is not None for pose in self.poses),
             bool(self.distances or self.heights),
         )
+
+    def within(self, frames: Collection[FrameKey]) -> Control:
+        """Without the poses of other frames than these, if they may be left out.
+
+        Raises:
+            InputError: none of the poses is of one of these frames.
+        """
+        if not self.spare or not self.poses:
+            return self
+        poses = [pose for pose in self.poses if pose.frame in frames]
+        if not poses:
+            raise InputError(
+                f"control: none of the {len(self.poses)} poses, of frames {self.poses[0].frame} to "
+                f"{self.poses[-1].frame}, is of a frame of the source; a control file can name the first_frame"
+            )
+        return replace(self, poses=poses)
 
     @property
     def frames(self) -> list[FrameKey]:
@@ -245,13 +264,14 @@ def find_frames(control: Control, frames: Sequence[tuple[int, str]]) -> dict[Fra
     """Position of each frame of the control among those with these indices and names.
 
     Raises:
-        InputError: a frame is not there.
+        InputError: a frame is not there that may not be left out.
     """
     by_name: dict[FrameKey, int] = {}
     for position, (index, _) in enumerate(frames):
         by_name.update({index: position, str(index): position})
     by_name.update({PurePath(name).stem: position for position, (_, name) in enumerate(frames)})
     by_name.update({name: position for position, (_, name) in enumerate(frames)})
+    control = control.within(by_name.keys())
     missing = [key for key in control.frames if key not in by_name]
     if missing:
         raise InputError(f"control: there is no frame {missing[0]!r} among the {len(frames)} frames")
@@ -285,51 +305,7 @@ def locate(
                 name = control.points[row].name
                 raise InputError(f"control: point {name} at {list(xy)} in frame {key!r} is outside of the lens")
         marks.append(tracks)
-    return LocatedControl(control, found, [frame.name for frame in frames], marks)
-
-
-def read_control(path: str | Path) -> Control:
-    """Read control from a JSON file: lists "poses", "points", "distances" and "heights" of objects.
-
-    The keys of the objects are the attributes of `KnownPose`, `MarkedPoint`, `KnownDistance` and `KnownHeight`.
-
-    Raises:
-        InputError: not readable, not JSON, an unknown key, or a value that is none.
-    """
-    path = Path(path)
-    content = read_json(path, "control file")
-    try:
-        return control_of(content)
-    except InputError as error:
-        raise InputError(f"control file {path}: {error}") from error
-
-
-def control_of(content: Any) -> Control:
-    """Control from the content of its file, which is also that of its `asdict` as JSON; errors as in `read_control`."""
-    if not isinstance(content, dict) or not set(content) <= set(_KINDS):
-        given = ", ".join(content) if isinstance(content, dict) else type(content).__name__
-        raise InputError(f"it holds {given}; an object with {', '.join(_KINDS)} is expected")
-    kinds: tuple[type, ...] = (KnownPose, MarkedPoint, KnownDistance, KnownHeight)
-    parts = {name: _items(content.get(name, []), name, kind) for name, kind in zip(_KINDS, kinds, strict=True)}
-    return Control(**parts)
-
-
-def _items(values: Any, name: str, kind: type) -> list[Any]:
-    if not isinstance(values, list):
-        raise InputError(f'"{name}" is a {type(values).__name__}; a list is expected')
-    known = [f.name for f in fields(kind)]
-    items = []
-    for i, value in enumerate(values):
-        try:
-            if not isinstance(value, dict) or not set(value) <= set(known):
-                raise InputError(f"it is {value!r}; an object with {', '.join(known)} is expected")
-            items.append(kind(**value))
-        except InputError as error:
-            raise InputError(f"{name}[{i}]: {error}") from error
-        except TypeError as error:  # a key is missing
-            missing = str(error).rpartition(": ")[2].replace("'", '"')
-            raise InputError(f"{name}[{i}]: {missing} is missing") from error
-    return items
+    return LocatedControl(control.within(found.keys()), found, [frame.name for frame in frames], marks)
 
 
 def _check_vector(name: str, value: Any, length: int) -> None:

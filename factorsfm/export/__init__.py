@@ -5,9 +5,10 @@ Takes a `Reconstruction`, gives files. May import `result` and the rooms below i
 
 from factorsfm.export.colmap import write_colmap
 from factorsfm.export.formats import FORMATS, Format, export
-from factorsfm.export.options import ExportOptions, UpAxis
+from factorsfm.export.options import ExportOptions
 from factorsfm.export.ply import write_ply
 from factorsfm.export.trajectory import write_trajectory
+from factorsfm.support.up_axis import UpAxis
 
 __all__ = [
     "FORMATS",

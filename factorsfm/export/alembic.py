@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.export.shot import Shot, linear_colors
-from factorsfm.export.vfx import failures_as_os_errors, require
+from factorsfm.support.extras import failures_as_os_errors, require
 
 CAMERA, POINTS = "camera", "points"
 

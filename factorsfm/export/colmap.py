@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,6 +13,8 @@ import pycolmap
 from numpy.typing import NDArray
 
 from factorsfm.export.image_names import image_name
+from factorsfm.export.shot import Shot
+from factorsfm.export.training import seen_in_training, write_training_images
 from factorsfm.result.reconstruction import Reconstruction
 
 
@@ -69,6 +71,17 @@ def write_colmap_binary(reconstruction: Reconstruction, folder: str | Path) -> N
     with tempfile.TemporaryDirectory() as text:
         write_colmap(reconstruction, text)
         pycolmap.Reconstruction(text).write_binary(folder)
+
+
+def write_colmap_training(shot: Shot, folder: Path, write: Callable[[Reconstruction, Path], None]) -> None:
+    """Write a folder for training: the model in ``sparse/0``, and images and masks as `write_training_images` does.
+
+    Args:
+        write: `write_colmap` or `write_colmap_binary`.
+    """
+    new = seen_in_training(shot)
+    write_training_images(shot, new, folder)
+    write(new, folder / "sparse" / "0")
 
 
 def _observations(reconstruction: Reconstruction) -> _Observations:

@@ -9,10 +9,12 @@ from pathlib import Path
 from factorsfm.export.after_effects import write_after_effects
 from factorsfm.export.alembic import write_alembic
 from factorsfm.export.blender import write_blender
-from factorsfm.export.colmap import write_colmap, write_colmap_binary
+from factorsfm.export.colmap import write_colmap, write_colmap_binary, write_colmap_training
+from factorsfm.export.lens import write_lens
 from factorsfm.export.nerfstudio import write_nerfstudio
 from factorsfm.export.nuke import write_chan, write_nuke
-from factorsfm.export.options import ExportOptions, UpAxis
+from factorsfm.export.opentrackio import write_opentrackio
+from factorsfm.export.options import ExportOptions
 from factorsfm.export.ply import write_ply
 from factorsfm.export.shot import Defaults, Shot, make_shot
 from factorsfm.export.stmap import write_stmaps, write_undistorted
@@ -29,6 +31,7 @@ from factorsfm.export.writing import complete_file, complete_folder
 from factorsfm.result.reconstruction import Reconstruction
 from factorsfm.support.errors import InputError
 from factorsfm.support.file_names import check_name
+from factorsfm.support.up_axis import UpAxis
 
 _AS_RECONSTRUCTED = Defaults()
 
@@ -42,23 +45,41 @@ class Format:
         write: called with the shot and a path: a new file, or an empty folder.
         is_folder: whether the format is a folder of files.
         defaults: values of options that the user does not set.
+        trains: whether trainers of splats and radiance fields read it: images can be undistorted and masked.
     """
 
     description: str
     write: Callable[[Shot, Path], None]
     is_folder: bool = False
     defaults: Defaults = _AS_RECONSTRUCTED
+    trains: bool = False
 
 
 def _reconstruction_only(write: Callable[[Reconstruction, Path], None]) -> Callable[[Shot, Path], None]:
     return lambda shot, path: write(shot.reconstruction, path)
 
 
+def _colmap(write: Callable[[Reconstruction, Path], None]) -> Callable[[Shot, Path], None]:
+    """The model alone, or with images and masks."""
+
+    def write_either(shot: Shot, path: Path) -> None:
+        if shot.options.undistorted:
+            write_colmap_training(shot, path, write)
+        else:
+            write(shot.reconstruction, path)
+
+    return write_either
+
+
 FORMATS = {
-    "colmap": Format("COLMAP model, text", _reconstruction_only(write_colmap), is_folder=True),
-    "colmap-binary": Format("COLMAP model, binary", _reconstruction_only(write_colmap_binary), is_folder=True),
+    "colmap": Format("COLMAP model, text", _colmap(write_colmap), is_folder=True, trains=True),
+    "colmap-binary": Format("COLMAP model, binary", _colmap(write_colmap_binary), is_folder=True, trains=True),
     "nerfstudio": Format(
-        "transforms.json with images and points", write_nerfstudio, is_folder=True, defaults=Defaults(UpAxis.Z)
+        "transforms.json with images and points",
+        write_nerfstudio,
+        is_folder=True,
+        defaults=Defaults(UpAxis.Z),
+        trains=True,
     ),
     "ply": Format("points", _reconstruction_only(write_ply)),
     "tum": Format("camera path, TUM", write_tum),
@@ -82,6 +103,14 @@ FORMATS = {
     "usd": Format("USD stage", write_usd, defaults=Defaults(UpAxis.Y, scale=100.0, first_frame=1001)),
     "alembic": Format("Alembic archive", write_alembic, defaults=Defaults(UpAxis.Y, first_frame=1001)),
     "stmap": Format("maps that undistort and distort, 32-bit EXR", write_stmaps, is_folder=True),
+    "lens": Format(
+        "the lens for Nuke, Blender and 3DEqualizer, with its deviation in each", write_lens, is_folder=True
+    ),
+    "opentrackio": Format(
+        "samples of camera and lens in OpenTrackIO",
+        write_opentrackio,
+        defaults=Defaults(UpAxis.Z, first_frame=1001),
+    ),
     "undistorted": Format(
         "the footage without distortion", write_undistorted, is_folder=True, defaults=Defaults(first_frame=1001)
     ),
@@ -128,6 +157,17 @@ def export(
         raise InputError(
             f"{format} is for images of one size, and these have {len(sizes)}; {', '.join(_ANY_SIZES)} take them"
         )
-    shot = make_shot(reconstruction, options or ExportOptions(), chosen.defaults)
+    options = options or ExportOptions()
+    _check_training(format, options)
+    shot = make_shot(reconstruction, options, chosen.defaults)
     with (complete_folder if chosen.is_folder else complete_file)(Path(path)) as place:
         chosen.write(shot, place)
+
+
+def _check_training(format: str, options: ExportOptions) -> None:
+    """Refuse options of formats for training where they say nothing."""
+    trains = [name for name, known in FORMATS.items() if known.trains]
+    if (options.undistorted or options.masks is not None) and format not in trains:
+        raise InputError(f"undistorted images and masks are for {', '.join(trains)}, not for {format}")
+    if options.masks is not None and format != "nerfstudio" and not options.undistorted:
+        raise InputError(f"masks go with images, which {format} has only undistorted")

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import StrEnum
 from pathlib import Path
 
+from factorsfm.priors.masks import MaskPrior
 from factorsfm.support.errors import InputError
+from factorsfm.support.up_axis import UpAxis
 
 # Values that every format can hold; a value outside has probably another unit.
 _RANGES: dict[str, tuple[float, float, str]] = {
@@ -15,14 +16,6 @@ _RANGES: dict[str, tuple[float, float, str]] = {
     "sensor_width": (1e-3, 1e6, "millimetres"),
     "scale": (1e-9, 1e9, "a length"),
 }
-
-
-class UpAxis(StrEnum):
-    """The world axis that points up in the first frame; the world is right-handed and its x axis points right."""
-
-    Y = "y"  # x right, y up, z towards the viewer: Nuke, USD, Alembic
-    Z = "z"  # x right, y into the picture, z up: Blender, nerfstudio
-    MINUS_Y = "-y"  # x right, y down, z into the picture: OpenCV, COLMAP, After Effects, the reconstruction itself
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,6 +34,9 @@ class ExportOptions:
             exists. It may have another size than what was solved, such as the originals of proxies, with the same
             aspect ratio: the lens is scaled. A sequence that has all numbers of a numbered source goes with it by the
             numbers, every other footage frame by frame from the first one on.
+        undistorted: of the formats for training (COLMAP, nerfstudio): whether images are written without distortion,
+            with pinhole cameras. COLMAP's formats are a model alone without it, and a whole folder with it.
+        masks: of the same formats: what trainers are to ignore besides what moves by itself, as `open_masks` takes it.
 
     Raises:
         InputError: a value is out of range, or the footage does not exist.
@@ -52,6 +48,8 @@ class ExportOptions:
     up_axis: UpAxis | str | None = None
     scale: float | None = None
     footage: str | Path | None = None
+    undistorted: bool = False
+    masks: str | Path | MaskPrior | None = None
 
     def __post_init__(self) -> None:
         for name, (low, high, unit) in _RANGES.items():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from factorsfm.export.other_pixels import in_other_pixels
 from factorsfm.frames.folders import read_image
 from factorsfm.frames.numbering import sequence_of
 from factorsfm.frames.reading import read_frames
@@ -87,26 +87,11 @@ def at_size_of(reconstruction: Reconstruction, footage: Path) -> Reconstruction:
         new.rescale(round(x * lens.width), round(y * lens.height))
         return new
 
-    def placed(xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    def placed(_: pycolmap.Camera, xy: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray((xy + 0.5) * np.array([x, y]) - 0.5)
 
-    moving = reconstruction.moving
-    return replace(
-        reconstruction,
-        camera=scaled(reconstruction.camera),
-        frames=[replace(f, camera=_unless_none(scaled, f.camera)) for f in reconstruction.frames],
-        observation_xy=placed(reconstruction.observation_xy),
-        moving=None if moving is None else replace(moving, xy=placed(moving.xy)),
-        observation_error=reconstruction.observation_error * np.sqrt(x * y),
-        noise=None,
-        rolled=None,
-    )
-
-
-def _unless_none(
-    scaled: Callable[[pycolmap.Camera], pycolmap.Camera], camera: pycolmap.Camera | None
-) -> pycolmap.Camera | None:
-    return None if camera is None else scaled(camera)
+    new = in_other_pixels(reconstruction, scaled, placed)
+    return replace(new, observation_error=reconstruction.observation_error * np.sqrt(x * y))
 
 
 def _check_aspect(camera: pycolmap.Camera, width: int, height: int, footage: Path) -> None:

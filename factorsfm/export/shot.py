@@ -16,8 +16,9 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from factorsfm.camera.undistortion import distorts
 from factorsfm.export.nulls import Null, moving_nulls, point_nulls
-from factorsfm.export.options import ExportOptions, UpAxis
+from factorsfm.export.options import ExportOptions
 from factorsfm.export.other_footage import Numbering, at_size_of, match_numbers, of_source
 from factorsfm.frames.fields import Fields
 from factorsfm.result.image_sources import fields_of
@@ -25,15 +26,8 @@ from factorsfm.result.other_world import in_other_world
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.result.supervised import named_points
 from factorsfm.support.similarity import Similarity
+from factorsfm.support.up_axis import FILM_CAMERA, TURNED_WORLD, UpAxis
 
-_TURNED_WORLD = {  # exported world from the reconstruction's
-    UpAxis.MINUS_Y: np.eye(3),
-    UpAxis.Y: np.diag([1.0, -1.0, -1.0]),
-    UpAxis.Z: np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
-}
-_FILM_CAMERA = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV camera axes from film camera axes
-# Models that equal a pinhole if all parameters besides focal length and principal point are 0.
-_PINHOLE_IF_ZERO = frozenset({"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"})
 _DEFAULT_FPS = 24.0
 _FRAME_RATES = (24000 / 1001, 24.0, 25.0, 30000 / 1001, 30.0, 48.0, 50.0, 60000 / 1001, 60.0)
 
@@ -172,7 +166,7 @@ class Shot:
     @cached_property
     def world_from_film(self) -> NDArray[np.float64]:
         """(k, 4, 4) camera to world of the registered frames; camera x right, y up, looking along -z."""
-        return np.asarray(self.world_from_opencv @ _FILM_CAMERA, dtype=np.float64)
+        return np.asarray(self.world_from_opencv @ FILM_CAMERA, dtype=np.float64)
 
     @cached_property
     def nulls(self) -> list[Null]:
@@ -214,8 +208,7 @@ class Shot:
     @property
     def distorts(self) -> bool:
         """Whether the lens has distortion."""
-        camera = self.reconstruction.camera
-        return camera.model_name not in _PINHOLE_IF_ZERO or bool(np.any(camera.params[camera.extra_params_idxs()]))
+        return distorts(self.reconstruction.camera)
 
     @property
     def clipping(self) -> tuple[float, float]:
@@ -247,7 +240,7 @@ def make_shot(reconstruction: Reconstruction, options: ExportOptions, defaults: 
     """
     up_axis = UpAxis(options.up_axis) if options.up_axis is not None else defaults.up_axis
     scale = options.scale if options.scale is not None else defaults.scale
-    world = _TURNED_WORLD[up_axis]
+    world = TURNED_WORLD[up_axis]
     footage = Path(options.footage) if options.footage is not None else _source(reconstruction)
     if options.footage is not None:
         reconstruction = at_size_of(reconstruction, Path(options.footage))

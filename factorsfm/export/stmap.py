@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.camera.projection import PIXEL_CENTER
+from factorsfm.camera.projection import PIXEL_CENTER, pixels_from_normalized, without_distortion
+from factorsfm.camera.undistortion import Straightening, distorted_places, pixel_grid
 from factorsfm.export.shot import Shot
 from factorsfm.frames.folders import read_pixels
 from factorsfm.frames.reading import read_frames
@@ -21,7 +21,6 @@ Array = NDArray[np.float64]
 UNDISTORT, DISTORT = "undistort", "distort"
 
 _NOWHERE = -1.0  # outside of every image
-_SAME = 1e-3  # pixels; two points closer than that are one
 
 
 def write_stmaps(shot: Shot, folder: Path) -> None:
@@ -34,7 +33,8 @@ def write_stmaps(shot: Shot, folder: Path) -> None:
     zoom has a pair for each registered frame, with the number of the frame: ``undistort.1001.exr``.
     """
     for suffix, camera in _cameras(shot):
-        write_exr(folder / f"{UNDISTORT}{suffix}.exr", _stmap(_distorted_places(camera), camera))
+        places = distorted_places(camera, without_distortion(camera))
+        write_exr(folder / f"{UNDISTORT}{suffix}.exr", _stmap(places, camera))
         write_exr(folder / f"{DISTORT}{suffix}.exr", _stmap(_undistorted_places(camera), camera))
 
 
@@ -52,7 +52,7 @@ def write_undistorted(shot: Shot, folder: Path) -> None:
     if shot.footage is None:
         raise InputError("there is no footage to undistort; name a video file or a folder of images")
     own = {frame.index: frame.camera for frame in shot.reconstruction.frames if frame.camera is not None}
-    x, y = _straightening(camera)
+    straightening = _straightening(camera)
     for frame in read_frames(shot.footage, fields=shot.fields):
         height, width = frame.image.shape[:2]
         if (width, height) != (camera.width, camera.height):
@@ -61,10 +61,9 @@ def write_undistorted(shot: Shot, folder: Path) -> None:
             )
         index = frame.index - shot.numbering.shift
         if index in own:
-            x, y = _straightening(own[index])
+            straightening = _straightening(own[index])
         pixels = frame.image if frame.path is None else read_pixels(frame.path)
-        light = pixels.astype(np.float32) if pixels.dtype == np.float16 else pixels  # OpenCV knows no half
-        plate = cv2.remap(light, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT).astype(pixels.dtype)
+        plate = straightening.image(pixels)
         name = f"plate.{shot.first_frame + index:04d}"
         if plate.dtype.kind == "f":
             write_exr(folder / f"{name}.exr", plate[..., ::-1])
@@ -80,42 +79,15 @@ def _cameras(shot: Shot) -> list[tuple[str, pycolmap.Camera]]:
     return [(f".{number:04d}", shot.reconstruction.camera_of(frame)) for number, frame in registered]
 
 
-def _straightening(camera: pycolmap.Camera) -> NDArray[np.float32]:
-    """(2, h, w) x and y in the distorted image of each pixel of the undistorted one; centres at integers."""
-    places = np.nan_to_num(_distorted_places(camera), nan=-max(camera.width, camera.height)) - PIXEL_CENTER
-    return np.asarray(np.moveaxis(places, -1, 0), np.float32)
-
-
-def _distorted_places(camera: pycolmap.Camera) -> Array:
-    """(h, w, 2) position in the distorted image of each pixel of the undistorted one, in pixels from the corner.
-
-    NaN beyond the angle up to which the lens model is invertible.
-    """
-    focal, principal = _focal_and_principal(camera)
-    rays = (_pixels(camera) - principal) / focal
-    places = np.asarray(camera.img_from_cam(np.column_stack([rays, np.ones(len(rays))])), np.float64)
-    back = np.asarray(camera.cam_from_img(places), np.float64)
-    places[~(np.abs(back - rays) * focal < _SAME).all(axis=1)] = np.nan
-    return places.reshape(camera.height, camera.width, 2)
+def _straightening(camera: pycolmap.Camera) -> Straightening:
+    return Straightening(camera, without_distortion(camera))
 
 
 def _undistorted_places(camera: pycolmap.Camera) -> Array:
     """(h, w, 2) position in the undistorted image of each pixel of the distorted one, in pixels from the corner."""
-    rays = np.asarray(camera.cam_from_img(_pixels(camera)), np.float64)
-    focal, principal = _focal_and_principal(camera)
-    return (rays * focal + principal).reshape(camera.height, camera.width, 2)
-
-
-def _focal_and_principal(camera: pycolmap.Camera) -> tuple[Array, Array]:
-    """(2,) each, pixels."""
-    focal = np.array([camera.focal_length_x, camera.focal_length_y], np.float64)
-    return focal, np.array([camera.principal_point_x, camera.principal_point_y], np.float64)
-
-
-def _pixels(camera: pycolmap.Camera) -> Array:
-    """(h * w, 2) centres of all pixels, row by row."""
-    x, y = np.meshgrid(np.arange(camera.width) + PIXEL_CENTER, np.arange(camera.height) + PIXEL_CENTER)
-    return np.column_stack([x.ravel(), y.ravel()])
+    rays = np.asarray(camera.cam_from_img(pixel_grid(camera)), np.float64)
+    places = pixels_from_normalized(without_distortion(camera), rays) + PIXEL_CENTER
+    return places.reshape(camera.height, camera.width, 2)
 
 
 def _stmap(places: Array, camera: pycolmap.Camera) -> NDArray[np.float32]:

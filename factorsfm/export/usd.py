@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.export.options import UpAxis
 from factorsfm.export.shot import Shot, linear_colors
-from factorsfm.export.vfx import failures_as_os_errors, require
 from factorsfm.support.errors import InputError
+from factorsfm.support.extras import failures_as_os_errors, require
+from factorsfm.support.up_axis import UpAxis
 
 CAMERA, POINTS = "/factorsfm/camera", "/factorsfm/points"
 

@@ -52,6 +52,12 @@ def sequence_of(source: object) -> list[int] | None:
     return sequence_numbers([path.name for path in list_images(Path(source))])
 
 
+def first_number_of(source: object) -> int | None:
+    """Number of the first frame of a folder that holds a numbered sequence; None for every other source."""
+    numbers = sequence_of(source)
+    return numbers[0] if numbers is not None else None
+
+
 def chosen(images: list[tuple[int, Path]], frames: slice) -> list[tuple[int, Path]]:
     """The images whose numbers are in a range; the steps begin at the first number that is there.
 

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.control.known import Control, read_control
+from factorsfm.control.files import read_control
+from factorsfm.control.known import Control
 from factorsfm.frames.ranges import checked_range, in_range, parse_range, range_text
 from factorsfm.polish.measured import MeasuredShot
 from factorsfm.support.errors import InputError
@@ -92,13 +93,17 @@ class Changes:
         mask_regions: Iterable[MaskRegion | str],
         frames: slice | None,
         control: str | Path | Control | None,
+        first_number: int | None,
     ) -> Changes:
         """As `solve_again` takes them.
+
+        Args:
+            first_number: as in `read_control`.
 
         Raises:
             InputError: a region, the range or the control cannot be used.
         """
-        read = read_control(control) if isinstance(control, str | Path) else control
+        read = read_control(control, first_number) if isinstance(control, str | Path) else control
         return cls(
             tuple(map(str, without_tracks)),
             tuple(r if isinstance(r, MaskRegion) else MaskRegion.parse(r) for r in mask_regions),

@@ -57,10 +57,11 @@ def solve_again(
             "the result keeps no tracks to solve again: it is of images in any order, or of an earlier version; "
             "reconstruct the shot once more"
         )
-    changes = Changes.of(without_tracks, mask_regions, frames, control)
+    first_number = known.options.get("first_number")
+    changes = Changes.of(without_tracks, mask_regions, frames, control, first_number)
     measured = changes.applied(known.measured)
     if isinstance(tracks, str | Path):
-        tracks = read_tracks(tracks, first_number=known.options.get("first_number"))
+        tracks = read_tracks(tracks, first_number=first_number)
     if tracks is not None:
         measured = joined(measured, tracks, {frame.index: known.camera_of(frame) for frame in known.frames})
     with OneThreadEach():

@@ -18,7 +18,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from factorsfm.camera.files import camera_from_json, camera_to_json
-from factorsfm.control.known import control_of
+from factorsfm.control.files import control_of
 from factorsfm.frames.recorded import RecordedFootage, RecordedFrame
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.polish.measured import MeasuredShot

@@ -28,11 +28,20 @@ def read_json(path: str | Path, what: str) -> Any:
         InputError: the file cannot be read, or is not JSON.
     """
     try:
-        return json.loads(Path(path).read_text(encoding="utf-8-sig"), parse_int=_whole)
+        return parse_json(Path(path).read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise InputError(f"{what} {path} cannot be read: {error.strerror or error}") from error
     except (ValueError, RecursionError) as error:
         raise InputError(f"{what} {path} is not JSON: {error}") from error
+
+
+def parse_json(text: str) -> Any:
+    """The value of JSON text; a whole number beyond 64 bits becomes a float.
+
+    Raises:
+        ValueError, RecursionError: it is not JSON.
+    """
+    return json.loads(text, parse_int=_whole)
 
 
 def typed(kind: type[T], value: Any, where: str) -> T:

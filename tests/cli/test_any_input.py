@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 
 from factorsfm.camera.files import camera_to_json, read_camera
 from factorsfm.cli.main import main
-from factorsfm.control.known import read_control
+from factorsfm.control.files import read_control
 from factorsfm.result.reading import read_result
 from factorsfm.support.errors import InputError
 from tests.command_line import assert_error

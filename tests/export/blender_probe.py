@@ -6,6 +6,7 @@ Its arguments, after ``--``: the exported .py, a .chan file, an .obj file, an .e
 import json
 import runpy
 import sys
+import tempfile
 
 import addon_utils
 import bpy
@@ -76,6 +77,11 @@ def report_scene(script):
             scene.frame_set(frame)
             files[frame] = behind.image.filepath_from_user(image_user=behind.image_user)
         report["background"] = {"source": behind.image.source, "size": list(behind.image.size), "files": files}
+    addon_utils.enable("io_anim_nuke_chan")
+    bpy.context.view_layer.objects.active = camera
+    with tempfile.NamedTemporaryFile(suffix=".chan") as file:
+        bpy.ops.export.export_chan(filepath=file.name, rotation_order="ZXY")
+        report["written_chan"] = file.read().decode()
     return report
 
 
@@ -87,7 +93,7 @@ def report_chan(path):
     bpy.context.view_layer.objects.active = camera
     camera.rotation_mode = "QUATERNION"
     bpy.ops.import_scene.import_chan(
-        filepath=path, z_up=False, rotation_order="ZXY", sensor_width=36.0, sensor_height=36.0 * 480 / 640 * 600 / 640
+        filepath=path, z_up=False, rotation_order="ZXY", sensor_width=36.0, sensor_height=36.0 * 480 / 640 * 600 / 1200
     )
     scene = bpy.context.scene
     keys = sorted({key.co[0] for curve in camera.animation_data.action.fcurves for key in curve.keyframe_points})
@@ -117,7 +123,27 @@ def report_exr(path):
     }
 
 
-script, chan, obj, exr, output = sys.argv[sys.argv.index("--") + 1 :]
+def report_lens(path, exr):
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    clip = bpy.data.movieclips.load(exr)
+    runpy.run_path(path)
+    camera = clip.tracking.camera
+    names = (
+        "distortion_model",
+        "sensor_width",
+        "pixel_aspect",
+        "focal_length",
+        "focal_length_pixels",
+        "k1",
+        "k2",
+        "k3",
+    )
+    center = camera.principal_point_pixels if hasattr(camera, "principal_point_pixels") else camera.principal
+    return {**{name: getattr(camera, name) for name in names}, "center": list(center)}
+
+
+script, chan, obj, exr, lens, output = sys.argv[sys.argv.index("--") + 1 :]
 found = {"scene": report_scene(script), "chan": report_chan(chan), "obj": report_obj(obj), "exr": report_exr(exr)}
+found["lens"] = report_lens(lens, exr)
 with open(output, "w", encoding="utf-8") as file:
     json.dump(found, file)

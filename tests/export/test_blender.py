@@ -9,13 +9,17 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 from numpy.typing import NDArray
 
+from factorsfm.camera.other_models import distorting
 from factorsfm.camera.projection import with_focal
+from factorsfm.control.files import read_control
 from factorsfm.export import ExportOptions, export
 from factorsfm.result.reconstruction import Reconstruction
 from tests.export_problems import (
+    PARAMS,
     assert_same_cameras,
     hard_reconstruction,
     moved,
@@ -26,6 +30,7 @@ from tests.export_problems import (
 )
 
 SCALE = 3.0
+FOCAL = PARAMS[:2]
 BLENDER = shutil.which("blender")
 
 pytestmark = pytest.mark.skipif(BLENDER is None, reason="Blender is not installed (Debian's package: blender)")
@@ -37,8 +42,10 @@ def run_blender(folder: Path, footage: Path | None, shown: Reconstruction | None
     export(shown or reconstruction, folder / "scene.py", format="blender", options=options)
     export(reconstruction, folder / "camera.chan", format="chan", options=options)
     export(reconstruction, folder / "nuke", format="nuke", options=options)
+    export(reconstruction, folder / "lens", format="lens")
     probe = Path(__file__).with_name("blender_probe.py")
-    files = [folder / name for name in ("scene.py", "camera.chan", "nuke/points.obj", "nuke/undistort.exr", "report")]
+    names = ("scene.py", "camera.chan", "nuke/points.obj", "nuke/undistort.exr", "lens/blender.py", "report")
+    files = [folder / name for name in names]
     command = [str(BLENDER), "--background", "--factory-startup", "--python-exit-code", "1", "--python", str(probe)]
     done = subprocess.run([*command, "--", *map(str, files)], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -139,7 +146,7 @@ def test_blender_reads_the_stmap_from_the_bottom_left(report: dict[str, Any]) ->
     camera = hard_reconstruction().camera
     for row, values in exr["rows"].items():
         y = 480 - (int(row) + 0.5)  # from the top
-        rays = np.column_stack([(np.arange(640) + 0.5 - 290) / 600, np.full(640, (y - 262) / 640), np.ones(640)])
+        rays = np.column_stack([(np.arange(640) + 0.5 - 290) / 600, np.full(640, (y - 262) / 1200), np.ones(640)])
         places = camera.img_from_cam(rays)
         found = np.array(values).reshape(640, 4)
         np.testing.assert_allclose(found[:, 0] * 640, places[:, 0], atol=1e-3)
@@ -154,3 +161,25 @@ def test_blender_plays_a_movie_behind_the_camera(tmp_path: Path) -> None:
     writer.release()
     background = run_blender(tmp_path, movie)["scene"]["background"]
     assert (background["source"], background["size"]) == ("MOVIE", [640, 480])
+
+
+def test_blender_s_movie_clip_has_the_lens(report: dict[str, Any]) -> None:
+    """Blender distorts with OpenCV's k1 to k3, on pixels made square, about a centre counted from the bottom left."""
+    lens = report["lens"]
+    assert lens["distortion_model"] == "POLYNOMIAL"
+    assert lens["focal_length_pixels"] == pytest.approx(FOCAL[0], rel=1e-6)
+    assert lens["pixel_aspect"] == pytest.approx(FOCAL[1] / FOCAL[0], rel=1e-6)
+    np.testing.assert_allclose(lens["center"], [290, 480 - 262], atol=1e-3)
+    fitted = distorting(hard_reconstruction().camera, 3, 1.0).coefficients
+    assert [lens["k1"], lens["k2"], lens["k3"]] == pytest.approx(fitted, rel=1e-5)
+
+
+def test_what_blender_writes_as_chan_comes_back_as_control(report: dict[str, Any], tmp_path: Path) -> None:
+    (tmp_path / "a.chan").write_text(report["scene"]["written_chan"])
+    found = {pose.frame: pose for pose in read_control(tmp_path / "a.chan").poses}
+    reconstruction = hard_reconstruction()
+    for frame, center in zip(reconstruction.registered, reconstruction.camera_centers(), strict=True):
+        pose = found[frame.index]
+        np.testing.assert_allclose(np.asarray(pose.position) / SCALE, center, atol=1e-5)
+        turn = pycolmap.Rotation3d(np.asarray(pose.cam_from_world)) * frame.cam_from_world.rotation.inverse()
+        assert np.degrees(turn.angle()) < 1e-3

@@ -194,11 +194,11 @@ def test_nuke_script_projects_as_pycolmap(tmp_path: Path) -> None:
     root, camera = nodes["Root"], nodes["Camera"]
     assert (root["first_frame"], root["last_frame"], root["fps"]) == ("111", "121", "25")
     assert root["format"].strip('"').split()[:6] == ["640", "480", "0", "0", "640", "480"]
-    assert nuke_aspect(root) == nuke_aspect(nodes["Plate"]) == pytest.approx(640 / 600, abs=1e-9)
+    assert nuke_aspect(root) == nuke_aspect(nodes["Plate"]) == pytest.approx(1200 / 600, abs=1e-9)
     assert nodes["NotRegistered"]["label"] == '"No camera at frames 117"'
     assert (camera["class"], camera["rot_order"]) == ("Camera2", "ZXY")
     assert float(camera["focal"]) == pytest.approx(600 * 24.89 / 640, rel=1e-9)
-    assert float(camera["vaperture"]) == pytest.approx(480 * 600 / 640 * 24.89 / 640, rel=1e-9)
+    assert float(camera["vaperture"]) == pytest.approx(480 * 600 / 1200 * 24.89 / 640, rel=1e-9)
     knobs = {name: float(camera[name]) for name in ("focal", "haperture", "near", "far")}
     knobs |= {name: np.array(camera[name].strip("{}").split(), float) for name in ("win_translate", "win_scale")}
     translate, rotate = nuke_curves(camera["translate"]), nuke_curves(camera["rotate"])
@@ -424,19 +424,19 @@ def test_stmaps_in_openimageio(tmp_path: Path) -> None:
     camera = reconstruction.camera
     export(reconstruction, tmp_path / "out", format="stmap")
     undistort, distort = (read_exr(tmp_path / "out" / f"{name}.exr") for name in ("undistort", "distort"))
-    matrix = np.array([[600, 0, 290], [0, 640, 262], [0, 0, 1]], float)  # principal point from the corner
+    matrix = np.array([[600, 0, 290], [0, 1200, 262], [0, 0, 1]], float)  # principal point from the corner
     corners = np.stack(np.meshgrid(np.arange(640) + 0.5, np.arange(480) + 0.5), axis=-1)
     for found in (undistort, distort):
         assert found.shape == (480, 640, 3)
         assert (found[..., 2] == 0).all()
     # OpenCV knows the same model: a pixel of the straight image is at this place of the bent one.
-    rays = np.dstack([(corners - matrix[:2, 2]) / [600, 640], np.ones((480, 640))]).reshape(-1, 3)
+    rays = np.dstack([(corners - matrix[:2, 2]) / [600, 1200], np.ones((480, 640))]).reshape(-1, 3)
     bent, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, camera.params[4:])
     places = np.dstack([undistort[..., 0] * 640, (1 - undistort[..., 1]) * 480])
     np.testing.assert_allclose(places.reshape(-1, 2), bent[:, 0], atol=MAP_PIXEL)
     # and back
     places = np.dstack([distort[..., 0] * 640, (1 - distort[..., 1]) * 480]).reshape(-1, 2)
-    rays = np.column_stack([(places - matrix[:2, 2]) / [600, 640], np.ones(len(places))])
+    rays = np.column_stack([(places - matrix[:2, 2]) / [600, 1200], np.ones(len(places))])
     bent, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, camera.params[4:])
     np.testing.assert_allclose(bent[:, 0], corners.reshape(-1, 2), atol=MAP_PIXEL)
 
@@ -478,7 +478,7 @@ def test_undistorted_plates(tmp_path: Path, movie: bool) -> None:
     export(reconstruction, tmp_path / "out", format="undistorted", options=options)
     plates = sorted((tmp_path / "out").iterdir())
     assert [path.name for path in plates] == ["plate.0001.png", "plate.0002.png", "plate.0003.png"]
-    matrix = np.array([[600, 0, 289.5], [0, 640, 261.5], [0, 0, 1]], float)  # pixel centres at integers
+    matrix = np.array([[600, 0, 289.5], [0, 1200, 261.5], [0, 0, 1]], float)  # pixel centres at integers
     maps = cv2.initUndistortRectifyMap(
         matrix, reconstruction.camera.params[4:], np.eye(3), matrix, (640, 480), cv2.CV_32FC1
     )

@@ -104,7 +104,7 @@ def test_lens_and_observations_are_scaled_about_the_corner(tmp_path: Path, size:
     (camera,) = model.cameras.values()
     assert (camera.width, camera.height) == size
     x, y = size[0] / 640, size[1] / 480
-    expected = [600 * x, 640 * y, 290 * x, 262 * y, *solved.camera.params[4:]]
+    expected = [600 * x, 1200 * y, 290 * x, 262 * y, *solved.camera.params[4:]]
     np.testing.assert_allclose(camera.params, expected, rtol=1e-12)
     original = solved.observation_xy[np.isin(solved.observation_frame, [0])] + 0.5
     found = np.array([p.xy for p in model.image(1012).points2D])
@@ -113,10 +113,10 @@ def test_lens_and_observations_are_scaled_about_the_corner(tmp_path: Path, size:
 
 
 def assert_drawn_over(shown: np.ndarray, original: np.ndarray) -> None:
-    """The lens has pixels of 1.067 (PAL): the picture is stretched to square ones, and to an even width."""
+    """The lens has pixels of 2 (anamorphic): the picture is stretched to square ones."""
     height, width = original.shape[:2]
-    stretched = cv2.resize(original, (round(width * 640 / 600), height), interpolation=cv2.INTER_CUBIC)
-    assert shown.shape == (height, stretched.shape[1] + stretched.shape[1] % 2, 3)
+    stretched = cv2.resize(original, (round(width * 1200 / 600), height), interpolation=cv2.INTER_CUBIC)
+    assert shown.shape == (height, stretched.shape[1], 3)
     assert np.median(cv2.absdiff(shown[:, : stretched.shape[1]], stretched)) < 12  # JPEG, and what is drawn
 
 
@@ -172,7 +172,7 @@ def test_undistorted_plates_keep_the_bits_of_the_originals(tmp_path: Path, kind:
     export(solved, tmp_path / "out", format="undistorted", options=ExportOptions(footage=folder))
     (plate,) = (tmp_path / "out").iterdir()
     assert plate.name == ("plate.1001.exr" if kind == "half" else "plate.1001.png")
-    matrix = np.array([[600, 0, 289.5], [0, 640, 261.5], [0, 0, 1]], float)
+    matrix = np.array([[600, 0, 289.5], [0, 1200, 261.5], [0, 0, 1]], float)
     maps = cv2.initUndistortRectifyMap(matrix, solved.camera.params[4:], np.eye(3), matrix, (640, 480), cv2.CV_32FC1)
     expected = cv2.remap(original, *maps, cv2.INTER_CUBIC).astype(np.float64)
     found = read_pixels(plate)

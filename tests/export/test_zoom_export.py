@@ -49,7 +49,7 @@ def test_nerfstudio_has_intrinsics_per_frame(tmp_path: Path) -> None:
     export(reconstruction, tmp_path / "out", format="nerfstudio")
     frames = json.loads((tmp_path / "out" / "transforms.json").read_text())["frames"]
     np.testing.assert_allclose([frame["fl_x"] for frame in frames], focal)
-    np.testing.assert_allclose([frame["fl_y"] for frame in frames], focal * 640 / 600)
+    np.testing.assert_allclose([frame["fl_y"] for frame in frames], focal * 1200 / 600)
     assert {frame["k1"] for frame in frames} == {0.06}
 
 
@@ -95,7 +95,7 @@ def test_undistorted_plates_follow_the_zoom(tmp_path: Path) -> None:
 def test_chan_has_the_field_of_view_of_each_frame(tmp_path: Path) -> None:
     reconstruction, focal = zooming()
     export(reconstruction, tmp_path / "c.chan", format="chan")
-    expected = [math.degrees(2 * math.atan(240 / (f * 640 / 600))) for f in focal]
+    expected = [math.degrees(2 * math.atan(240 / (f * 1200 / 600))) for f in focal]
     np.testing.assert_allclose(np.loadtxt(tmp_path / "c.chan")[:, 7], expected)
 
 

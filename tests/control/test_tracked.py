@@ -1,0 +1,178 @@
+"""Cameras that other programs have tracked, as control: each file written by its own tool or by hand."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from numpy.typing import NDArray
+
+from factorsfm.control.files import read_control
+from factorsfm.control.known import Control, find_frames
+from factorsfm.export import ExportOptions, export
+from factorsfm.result.reconstruction import Reconstruction
+from factorsfm.support.errors import InputError
+from tests.export_problems import hard_reconstruction
+
+Array = NDArray[np.float64]
+
+FRAMES = [10, 12, 14, 18, 20]  # of the result
+
+
+def assert_poses(control: Control, reconstruction: Reconstruction, keys: list[Any]) -> None:
+    """The poses of the registered frames, in the world of the result."""
+    assert [pose.frame for pose in control.poses] == keys
+    centers = np.array([pose.position for pose in control.poses])
+    np.testing.assert_allclose(centers, reconstruction.camera_centers(), atol=1e-5)
+    size = np.linalg.norm(np.ptp(centers, axis=0))
+    for pose, frame in zip(control.poses, reconstruction.registered, strict=True):
+        assert pose.sigma == pytest.approx(0.01 * size, rel=1e-4)
+        assert pose.rotation_sigma == 0.5
+        given = pycolmap.Rotation3d(np.asarray(pose.cam_from_world))
+        assert (given * frame.cam_from_world.rotation.inverse()).angle() < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("format", "name", "first"),
+    [
+        ("chan", "a.chan", 1001),
+        ("usd", "a.usda", 1001),
+        ("usd", "a.usdc", 1),
+        ("colmap", "model", None),
+        ("colmap-binary", "model", None),
+        ("nerfstudio", "nerf", None),
+        ("nerfstudio", "nerf/transforms.json", None),
+    ],
+)
+def test_what_is_exported_comes_back_in_its_world(tmp_path: Path, format: str, name: str, first: int | None) -> None:
+    if format == "usd":
+        pytest.importorskip("pxr", reason="usd-core (extra vfx) is not installed")
+    reconstruction = hard_reconstruction()
+    options = ExportOptions(first_frame=first)
+    export(reconstruction, tmp_path / Path(name).parts[0], format=format, options=options)
+    control = read_control(tmp_path / name)
+    names = [f"{frame:06d}.png" for frame in FRAMES]
+    assert_poses(control, reconstruction, FRAMES if first is not None else names)
+
+
+def test_alembic_comes_back(tmp_path: Path) -> None:
+    pytest.importorskip("alembic3d", reason="alembic3d (extra alembic) is not installed")
+    reconstruction = hard_reconstruction()
+    export(reconstruction, tmp_path / "a.abc", format="alembic", options=ExportOptions(fps=24000 / 1001))
+    said = {"file": "a.abc", "fps": 24000 / 1001}
+    (tmp_path / "control.json").write_text(json.dumps({"cameras": said}))
+    assert_poses(read_control(tmp_path / "control.json"), reconstruction, FRAMES)
+
+
+def test_usd_of_another_unit_and_below_a_moving_parent(tmp_path: Path) -> None:
+    usd = pytest.importorskip("pxr.Usd", reason="usd-core (extra vfx) is not installed")
+    from pxr import Gf, UsdGeom
+
+    stage = usd.Stage.CreateNew(str(tmp_path / "a.usda"))
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    UsdGeom.SetStageMetersPerUnit(stage, 0.01)
+    dolly = UsdGeom.Xform.Define(stage, "/dolly").AddTranslateOp()
+    camera = UsdGeom.Camera.Define(stage, "/dolly/camera")
+    camera.AddScaleOp().Set(Gf.Vec3f(3, 3, 3))
+    for frame in range(3):
+        dolly.Set(Gf.Vec3d(100 * frame, 20, 170), 1001 + frame)
+    stage.Save()
+    poses = read_control(tmp_path / "a.usda").poses
+    assert [pose.frame for pose in poses] == [0, 1, 2]
+    # z up in the file: x right, y into the picture; a camera there looks down without being turned
+    np.testing.assert_allclose([pose.position for pose in poses], [[k, -1.7, 0.2] for k in range(3)], atol=1e-9)
+    down = pycolmap.Rotation3d(np.asarray(poses[0].cam_from_world)).matrix() @ [0.0, 1.0, 0.0]
+    np.testing.assert_allclose(down, [0, 0, 1], atol=1e-9)
+    UsdGeom.Camera.Define(stage, "/second")
+    stage.Save()
+    with pytest.raises(InputError, match="it holds 2 cameras"):
+        read_control(tmp_path / "a.usda")
+
+
+def chan(path: Path, first: int, count: int = 4) -> Path:
+    """A camera that goes right and pans; y up, looking along -z."""
+    lines = [f"{first + k} {0.5 * k} 1.5 0 0 {-10 * k} 0 40" for k in range(count)]
+    path.write_text("# Nuke\n" + "\n".join(lines) + "\n")
+    return path
+
+
+def test_chan_by_hand(tmp_path: Path) -> None:
+    poses = read_control(chan(tmp_path / "a.chan", 1)).poses
+    assert [pose.frame for pose in poses] == [0, 1, 2, 3]
+    np.testing.assert_allclose([pose.position for pose in poses], [[0.5 * k, -1.5, 0] for k in range(4)], atol=1e-12)
+    turned = pycolmap.Rotation3d(np.asarray(poses[3].cam_from_world)).matrix()
+    expected = cv2.Rodrigues(np.array([0, -math.radians(30), 0]))[0]  # 30 degrees to the right, y down
+    np.testing.assert_allclose(turned, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("first", "first_number", "first_frame", "expected"),
+    [
+        (1001, None, None, 0),
+        (1003, None, None, 2),  # a camera that begins late
+        (7, None, None, 6),
+        (0, None, None, 0),
+        (101, None, 101, 0),
+        (1043, 1043, None, 1043),  # a numbered sequence
+        (1, 1043, 1, 1043),  # which the other program counts from 1
+    ],
+)
+def test_numbers_of_a_timeline(
+    tmp_path: Path, first: int, first_number: int | None, first_frame: int | None, expected: int
+) -> None:
+    chan(tmp_path / "a.chan", first)
+    said = {"file": "a.chan", **({} if first_frame is None else {"first_frame": first_frame})}
+    (tmp_path / "control.json").write_text(json.dumps({"cameras": said}))
+    poses = read_control(tmp_path / "control.json", first_number).poses
+    assert [pose.frame for pose in poses] == [expected + k for k in range(4)]
+
+
+def test_a_control_file_can_say_how_well_it_is_known(tmp_path: Path) -> None:
+    chan(tmp_path / "a.chan", 1001)
+    distance = {"length": 1.5, "sigma": 0.01, "frames": [0, 3]}
+    said = {"cameras": {"file": "a.chan", "sigma": 0.02, "rotation_sigma": 0.1}, "distances": [distance]}
+    (tmp_path / "control.json").write_text(json.dumps(said))
+    control = read_control(tmp_path / "control.json")
+    assert {(pose.sigma, pose.rotation_sigma) for pose in control.poses} == {(0.02, 0.1)}
+    assert len(control.distances) == 1
+
+
+def test_frames_that_the_source_does_not_have_are_left_out(tmp_path: Path) -> None:
+    control = read_control(chan(tmp_path / "a.chan", 1001, 30))
+    assert find_frames(control, [(k, f"{k:06d}") for k in range(5, 9)]) == {5: 0, 6: 1, 7: 2, 8: 3}
+    with pytest.raises(InputError, match=r"none of the 30 poses, of frames 0 to 29, is of a frame of the source"):
+        find_frames(control, [(k, f"{k:06d}") for k in range(100, 104)])
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("a.chan", "", "it holds no pose of a camera"),
+        ("a.chan", "1 2 3\n", 'the line "1 2 3" is not "frame tx ty tz rx ry rz"'),
+        ("a.chan", "1 0 0 0 0 0 0\n2 0 0 0 0 0 0\n", "stands still"),
+        ("a.chan", "1 0 0 0 0 0 0\n2 0 nan 0 0 0 0\n", "is not finite"),
+        ("a.usda", "no stage", "it is no USD stage"),
+        ("transforms.json", '{"frames": [{"file_path": "a", "transform_matrix": [[1]]}]}', "transform_matrix of a is"),
+        ("control.json", '{"cameras": {"sigma": 1}}', "cameras"),
+        ("control.json", '{"cameras": {"file": "none.chan"}}', "there is no file"),
+        ("control.json", '{"cameras": {"file": "none.fbx"}}', "there is no file"),
+    ],
+)
+def test_files_that_hold_no_camera_are_refused_in_one_sentence(
+    tmp_path: Path, name: str, text: str, message: str
+) -> None:
+    if name.endswith("usda"):
+        pytest.importorskip("pxr", reason="usd-core (extra vfx) is not installed")
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputError, match=message) as caught:
+        read_control(tmp_path / name)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_folder_without_a_model(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"neither images.bin nor images.txt nor transforms.json"):
+        read_control(tmp_path)
