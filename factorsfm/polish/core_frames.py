@@ -23,24 +23,29 @@ _IN_COMMON = 0.25  # of the tracks of a frame, which the one before it sees, too
 
 
 def core_frames(observations: Observations, frames: int) -> Index:
-    """Rows of the fewest frames of a shot, evenly spread, each of which sees enough of what the one before does."""
+    """Rows of the fewest frames of a shot, evenly spread, each of which sees enough of what the one before does.
+
+    Where the view is lost, all frames together do not see enough of what they did before either.
+    """
+    lost = _in_common(observations, np.arange(frames)) < _IN_COMMON
     limit = _FRAMES
     while limit < frames:
         rows = np.linspace(0, frames - 1, limit).astype(int)
-        if _least_in_common(observations, rows) >= _IN_COMMON:
+        enough = _in_common(observations, rows) >= _IN_COMMON
+        if (enough | np.logical_or.reduceat(lost, rows[:-1])).all():
             return rows
         limit *= 2
     return np.arange(frames)
 
 
-def _least_in_common(observations: Observations, rows: Index) -> float:
-    """Share of the tracks of a frame that the previous one of some frames sees, too, where it is least."""
+def _in_common(observations: Observations, rows: Index) -> Array:
+    """Share of the tracks of each of some frames but the first, which the previous one of these sees, too."""
     o = observations
     keep = np.isin(o.frame, rows)
     frame, point = np.searchsorted(rows, o.frame[keep]), o.point[keep]  # sorted by point, and by frame there
     follows = (np.diff(point) == 0) & (np.diff(frame) == 1)
     common = np.bincount(frame[1:][follows], minlength=len(rows))[1:]
-    return float((common / np.maximum(np.bincount(frame, minlength=len(rows))[1:], 1)).min())
+    return np.asarray(common / np.maximum(np.bincount(frame, minlength=len(rows))[1:], 1))
 
 
 def in_all_frames(

@@ -34,6 +34,16 @@ def test_frames_are_few_as_long_as_they_see_the_same(length, expected):
     assert np.ptp(np.diff(rows)) <= 1
 
 
+def test_a_view_that_is_lost_asks_for_no_more_frames():
+    before, after = tracks_of(50, 200), tracks_of(50, 200)
+    both = Observations(
+        np.r_[before.frame, after.frame + 200],
+        np.r_[before.point, after.point + before.point.max() + 1],
+        np.concatenate([before.pixels, after.pixels]),
+    )
+    assert len(core_frames(both, 400)) == 100
+
+
 def test_a_short_shot_is_solved_on_all_frames():
     np.testing.assert_array_equal(core_frames(tracks_of(3, 80), 80), np.arange(80))
 
