@@ -188,8 +188,8 @@ class BundleAdjustment:
         camera = np.zeros(self.columns.size)
         camera[free] = -solution(conditioned(information[np.ix_(free, free)]), gradient[free])
         pull = normal.point_gradient.copy()
-        for cross, columns, span in blocks:
-            pull[span] += (camera[columns] @ cross).reshape(-1, 3)
+        for cross, columns, points in blocks:
+            pull[points] += (camera[columns] @ cross).reshape(-1, 3)
         return camera, -np.einsum("nij,nj->ni", point_covariance, pull)
 
     def _retract(self, camera: Array, point: Array) -> State:
@@ -264,23 +264,21 @@ class BundleAdjustment:
         """The residuals of the tracks, linearised at the present state."""
         return self._tracks.linearized(self.state)
 
-    def influences(self, columns: Index) -> Array:
+    def influences(self, marginals: Marginals, columns: Index) -> Array:
         """(n, p) by how much the residuals of each point alone move some columns of the camera side.
 
         At the minimum they cancel; their squares tell how uncertain the columns are, whatever the noise really is.
+
+        Args:
+            marginals: of the present state.
         """
-        normal = self._linearize()
-        blocks = self._elimination.cross_blocks(normal)
-        information, _, given_camera = reduced(normal, blocks, 0.0)
-        free = self._free
-        gain = np.zeros((self.columns.size, len(columns)))
-        gain[free] = covariance_of(conditioned(information[np.ix_(free, free)]))[:, np.searchsorted(free, columns)]
+        normal, gain = self._linearize(), marginals.camera[:, columns]
         moved = np.zeros((len(self.state.bearing), len(columns)))
         for t in normal.terms:
             by_camera = np.einsum("cdm,dm->mc", t.by_camera, t.residual)
             np.add.at(moved, t.point, np.einsum("mc,mcp->mp", by_camera, gain[t.columns]))
-        step = np.einsum("nij,nj->ni", given_camera, normal.point_gradient)
-        for cross, used, span in blocks:
+        step = np.einsum("nij,nj->ni", marginals.point, normal.point_gradient)
+        for cross, used, points in marginals.blocks:
             pull = cross.reshape(len(used), -1, 3)
-            moved[span] -= np.einsum("cni,ni,cp->np", pull, step[span], gain[used], optimize=True)
+            moved[points] -= np.einsum("cni,ni,cp->np", pull, step[points], gain[used], optimize=True)
         return -moved

@@ -14,15 +14,18 @@ from factorsfm.support.semidefinite import covariance_and_root
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-# Camera-point block of the information matrix (columns, 3 n), its columns, and its points.
-Block = tuple[Array, Index, slice]
+# Camera-point block of the information matrix (columns, 3 n), its columns, and its n points (ascending).
+Block = tuple[Array, Index, Index]
 # Rows of a frame, their columns, and the position of each entry among the columns; None: they are in order everywhere.
 Group = tuple[Index, Index, Index | None]
 # Flat positions of the values of columns of which each row has its own, whether no two have the same one, and these
 # columns; then of the sums over each point of those that all rows share, the point's first row, and these columns.
 Places = tuple[NDArray[np.intp], bool, Index, NDArray[np.intp], Index, Index]
 
-_CHUNK = 512  # points eliminated together
+# Points that are eliminated together make a block that is dense over all cameras that see any of them. So those that
+# the same cameras see are: in pieces, which are joined where the zeros that this adds cost less than one block more,
+# about as much as so many points do.
+_PIECE, _LARGEST, _ONE_BLOCK = 32, 512, 40
 _ROWS = 16  # of a block worked on at once: they stay in the processor's cache
 
 
@@ -70,7 +73,7 @@ class Elimination:
     def __init__(self, columns: int, points: int) -> None:
         self._columns, self._points = columns, points
         self._groups: list[tuple[list[Group], Index, Index]] | None = None
-        self._chunks: list[tuple[list[Places], Index, slice]] | None = None
+        self._chunks: list[tuple[list[tuple[Index, Places]], Index, Index]] | None = None
 
     def normal_equations(self, terms: list[Term], *, cameras: bool = True) -> Normal:
         """Information and gradient of the cameras, if wanted, and of each point; each term is sorted by point."""
@@ -131,20 +134,23 @@ class Elimination:
                 self._groups.append((groups, *np.unique(t.point, return_index=True)))
         return self._groups
 
-    def _chunk_indices(self, terms: list[Term]) -> list[tuple[list[Places], Index, slice]]:
-        """For every chunk of points: places of each term's values in the cross blocks, the columns, the points."""
+    def _chunk_indices(self, terms: list[Term]) -> list[tuple[list[tuple[Index, Places]], Index, Index]]:
+        """For every chunk of points: rows of each term and places in the cross blocks, the columns, the points."""
         if self._chunks is None:
             self._chunks = []
-            n = self._points
-            for begin in range(0, n, _CHUNK):
-                end = min(n, begin + _CHUNK)
-                rows = [slice(*np.searchsorted(t.point, [begin, end])) for t in terms]
+            chunks = _seen_alike(terms[0], self._points) if self._points else []
+            chunk, place = np.empty((2, self._points), np.int64)  # of each point, and where it is there
+            for k, points in enumerate(chunks):
+                chunk[points], place[points] = k, np.arange(len(points))
+            by_term = [_rows_of(chunk[t.point], len(chunks)) for t in terms]
+            for k, points in enumerate(chunks):
+                rows = [of_chunk[k] for of_chunk in by_term]
                 columns, locals_ = self._occurring(*(t.columns[r] for t, r in zip(terms, rows, strict=True)))
-                flat = [
-                    self._places(t.columns[r], local.T[:, None] * 3 * (end - begin), t.point[r] - begin)
+                places = [
+                    (r, self._places(t.columns[r], local.T[:, None] * 3 * len(points), place[t.point[r]]))
                     for t, r, local in zip(terms, rows, locals_, strict=True)
                 ]
-                self._chunks.append((flat, columns, slice(begin, end)))
+                self._chunks.append((places, columns, points))
         return self._chunks
 
     def _places(self, columns: Index, begin: Index, point: Index) -> Places:
@@ -174,12 +180,11 @@ class Elimination:
     def cross_blocks(self, normal: Normal) -> list[Block]:
         """Camera-point blocks of the information matrix, dense over the columns of each chunk."""
         blocks = []
-        for flat, columns, span in self._chunk_indices(normal.terms):
-            n = span.stop - span.start
+        for places, columns, points in self._chunk_indices(normal.terms):
+            n = len(points)
             cross = np.zeros(len(columns) * 3 * n)
-            for t, (position, single, own, of_sums, first, common) in zip(normal.terms, flat, strict=True):
-                rows = slice(*np.searchsorted(t.point, [span.start, span.stop]))
-                by_camera, by_point = t.by_camera[:, :, rows], t.decorrelated_by_point[:, :, rows]
+            for t, (rows, (position, single, own, of_sums, first, common)) in zip(normal.terms, places, strict=True):
+                by_camera, by_point = t.by_camera.take(rows, axis=2), t.decorrelated_by_point.take(rows, axis=2)
                 by_own = by_camera[own] if len(common) else by_camera
                 values = np.einsum("cdm,pdm->cpm", by_own, by_point).ravel()
                 if single and t is normal.terms[0]:
@@ -191,8 +196,40 @@ class Elimination:
                 if len(common) and len(first):
                     values = np.einsum("cdm,pdm->cpm", by_camera[common], by_point)
                     cross[of_sums] += np.add.reduceat(values, first, axis=2).ravel()
-            blocks.append((cross.reshape(len(columns), 3 * n), columns, span))
+            blocks.append((cross.reshape(len(columns), 3 * n), columns, points))
         return blocks
+
+
+def _seen_alike(term: Term, count: int) -> list[Index]:
+    """All points (ascending in each) in chunks that about the same frames see."""
+    frame, first = term.frame, np.searchsorted(term.point, np.arange(count))
+    begins, ends = frame[first], frame[np.append(first[1:], len(frame)) - 1]
+    order = np.lexsort((ends, begins, -np.log2(ends - begins + 1.0).astype(int)))
+    pieces = np.split(order, range(_PIECE, count, _PIECE))
+    piece = np.empty(count, np.int64)
+    piece[order] = np.arange(count) // _PIECE
+    seen = np.zeros((len(pieces), int(frame.max(initial=0)) + 1), bool)
+    seen[piece[term.point], frame] = True
+
+    def cost(by: NDArray[np.bool_], points: int) -> int:
+        return int(by.sum()) ** 2 * (points + _ONE_BLOCK)
+
+    chunks: list[Index] = []
+    members, by = pieces[0], seen[0]
+    for more, its in zip(pieces[1:], seen[1:], strict=True):
+        size = len(members) + len(more)
+        if size <= _LARGEST and cost(by | its, size) <= cost(by, len(members)) + cost(its, len(more)):
+            members, by = np.concatenate([members, more]), by | its
+        else:
+            chunks.append(np.sort(members))
+            members, by = more, its
+    return [*chunks, np.sort(members)]
+
+
+def _rows_of(label: Index, count: int) -> list[Index]:
+    """Rows (ascending) of each of so many labels."""
+    order = np.argsort(label, kind="stable")
+    return np.split(order, np.searchsorted(label[order], np.arange(1, count)))
 
 
 def reduced(normal: Normal, blocks: list[Block], damping: float) -> tuple[Array, Array, Array]:
@@ -204,10 +241,10 @@ def reduced(normal: Normal, blocks: list[Block], damping: float) -> tuple[Array,
     information = normal.camera.copy()
     information[np.diag_indices_from(information)] *= 1.0 + damping
     gradient = normal.camera_gradient.copy()
-    for cross, columns, span in blocks:
-        half = _rooted(cross, root[span])
+    for cross, columns, points in blocks:
+        half = _rooted(cross, root[points])
         information[np.ix_(columns, columns)] -= half @ half.T
-        step = np.einsum("nij,nj->ni", point_covariance[span], normal.point_gradient[span])
+        step = np.einsum("nij,nj->ni", point_covariance[points], normal.point_gradient[points])
         gradient[columns] -= cross @ step.ravel()
     return information, gradient, point_covariance
 

@@ -31,8 +31,8 @@ class LeftOut:
         self._information, self._gradient, _ = reduced(normal, blocks, 0.0)
         size, points = len(normal.camera), len(normal.point)
         self._cross = np.zeros((size, points, 3))
-        for cross, columns, span in blocks:
-            self._cross[columns, span] = cross.reshape(len(columns), -1, 3)
+        for cross, columns, seen in blocks:
+            self._cross[np.ix_(columns, seen)] = cross.reshape(len(columns), -1, 3)
 
     def without(self, rows: NDArray[np.bool_]) -> tuple[Array, Array]:
         """Without these observations, nor the last one of a point of which one is left: (c, c), 0 for what nothing
@@ -50,8 +50,8 @@ class LeftOut:
             self._cross[:, touched],
         )
         known = self._eliminated(before, cross)
-        for block, columns, span in elimination.cross_blocks(part):
-            cross[columns, span] -= block.reshape(len(columns), -1, 3)
+        for block, columns, seen in elimination.cross_blocks(part):
+            cross[np.ix_(columns, seen)] -= block.reshape(len(columns), -1, 3)
         point[gone], pull[gone], cross[:, gone] = np.eye(3), 0.0, 0.0
         left = self._eliminated(Normal(nothing, zero, point, pull, []), cross)
         information = self._information - part.camera + left[0] - known[0]
@@ -76,5 +76,5 @@ class LeftOut:
     def _eliminated(self, normal: Normal, cross: Array) -> tuple[Array, Array]:
         """What the elimination of some points adds to information and gradient."""
         columns = np.flatnonzero(cross.any(axis=(1, 2)))
-        block = cross[columns].reshape(len(columns), 3 * cross.shape[1]), columns, slice(0, len(normal.point))
+        block = cross[columns].reshape(len(columns), 3 * cross.shape[1]), columns, np.arange(len(normal.point))
         return reduced(normal, [block], 0.0)[:2]

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.adjustment.columns import Columns
+from factorsfm.adjustment.elimination import Block
 from factorsfm.adjustment.state import State
 from factorsfm.support.rotations import cross_matrices
 from factorsfm.support.semidefinite import solution
@@ -26,12 +27,12 @@ class Marginals:
         camera: (c, c) covariance of the camera side, see `Columns`.
         point: (n, 3, 3) covariance of each point given the camera side: two tangent directions of the bearing (see
             `tangent_basis`), inverse distance.
-        blocks: camera-point blocks of the information matrix with their columns, by span of points.
+        blocks: camera-point blocks of the information matrix with their columns and points.
     """
 
     camera: Array
     point: Array
-    blocks: list[tuple[Array, Index, slice]]
+    blocks: list[Block]
 
     def relative(self, motion: Array, measured: Array) -> Array:
         """Covariance of the camera side when the coordinates are carried along with the points.
@@ -42,8 +43,8 @@ class Marginals:
         """
         pull = np.zeros((measured.shape[2], len(self.camera)))
         weighted = self.point @ measured
-        for cross, columns, span in self.blocks:
-            pull[:, columns] -= (cross @ weighted[span].reshape(-1, measured.shape[2])).T
+        for cross, columns, points in self.blocks:
+            pull[:, columns] -= (cross @ weighted[points].reshape(-1, measured.shape[2])).T
         moved = pull @ self.camera
         spread = moved @ pull.T + np.einsum("nig,nih->gh", measured, weighted)
         mixed, carried = motion @ moved, motion @ spread @ motion.T
@@ -57,9 +58,9 @@ class Marginals:
     def inverse_distances(self, points: Index) -> Array:
         """(p, p) joint covariance of the inverse distances of some points."""
         gain = np.zeros((len(points), len(self.camera)))
-        for cross, columns, span in self.blocks:
-            inside = np.nonzero((points >= span.start) & (points < span.stop))[0]
-            local = points[inside] - span.start
+        for cross, columns, members in self.blocks:
+            inside = np.flatnonzero(np.isin(points, members))
+            local = np.searchsorted(members, points[inside])
             picked = cross.reshape(len(columns), -1, 3)[:, local]
             gain[np.ix_(inside, columns)] = np.einsum("cpi,pi->pc", picked, self.point[points[inside], 2])
         joint = gain @ self.camera @ gain.T
@@ -73,9 +74,9 @@ class Marginals:
             camera: (c, c) covariance of the camera side, as it is or as `relative` gives it.
         """
         variance = self.point[:, 2, 2].copy()
-        for cross, columns, span in self.blocks:
-            gain = np.einsum("cni,ni->nc", cross.reshape(len(columns), -1, 3), self.point[span, 2])
-            variance[span] += np.einsum("nc,nc->n", gain @ camera[np.ix_(columns, columns)], gain)
+        for cross, columns, points in self.blocks:
+            gain = np.einsum("cni,ni->nc", cross.reshape(len(columns), -1, 3), self.point[points, 2])
+            variance[points] += np.einsum("nc,nc->n", gain @ camera[np.ix_(columns, columns)], gain)
         return np.sqrt(np.maximum(variance, 0.0))
 
 

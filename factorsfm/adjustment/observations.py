@@ -62,6 +62,11 @@ class Observations:
         """(n,) row of the first observation of each point."""
         return np.searchsorted(self.point, np.arange(self.point[-1] + 1 if len(self.point) else 0))
 
+    def rows_by_frame(self, frames: int) -> list[Index]:
+        """Rows (ascending) of each of so many frames."""
+        order = np.argsort(self.frame, kind="stable")
+        return np.split(order, np.searchsorted(self.frame[order], np.arange(1, frames)))
+
     def mean_by_point(self, values: Array) -> Array:
         """(n,) mean over the observations of each point of something that each has, (m,)."""
         first = self.first

@@ -132,9 +132,9 @@ def _by_neighbourhood(adjustment: BundleAdjustment, marginals: Marginals, term: 
     for _ in range(_TERMS):
         moved = first + marginals.camera @ parts.gradient(parts.decorrelated(moved))[0]
     inverse = np.asarray(parts.member * step[:, 2:])
-    for cross, columns, span in marginals.blocks:
-        gain = np.einsum("cni,ni->nc", cross.reshape(len(columns), -1, 3), marginals.point[span, 2])
-        inverse[span] -= gain @ moved[columns]
+    for cross, columns, points in marginals.blocks:
+        gain = np.einsum("cni,ni->nc", cross.reshape(len(columns), -1, 3), marginals.point[points, 2])
+        inverse[points] -= gain @ moved[columns]
     return np.asarray(moved), inverse
 
 
@@ -156,9 +156,9 @@ class _Neighbourhoods:
         by_point = np.einsum("idm,dm->im", t.by_point, residual)
         pull = np.stack([np.bincount(t.point, row, points) for row in by_point], 1)
         step = np.einsum("nij,nj->ni", self._marginals.point, pull)
-        for cross, columns, span in self._marginals.blocks:
-            through = np.einsum("cni,ni->cn", cross.reshape(len(columns), -1, 3), step[span])
-            sums[columns] -= through @ self.member[span]
+        for cross, columns, seen in self._marginals.blocks:
+            through = np.einsum("cni,ni->cn", cross.reshape(len(columns), -1, 3), step[seen])
+            sums[columns] -= through @ self.member[seen]
         return sums, step
 
     def decorrelated(self, moved: Array) -> Array:

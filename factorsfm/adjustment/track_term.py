@@ -14,6 +14,7 @@ from factorsfm.adjustment.residuals import by_lens_rows, by_pose_rows, cauchy, p
 from factorsfm.adjustment.state import State
 
 Array = NDArray[np.float64]
+Linear = tuple[Array, Array, Array, Array, Array]
 
 _NEAREST = 1e-6  # depth of a homogeneous point in front of the camera
 
@@ -46,6 +47,7 @@ class TrackTerm:
             free.append(columns.log_focal.start + self._group[:, None])
         free.append(np.broadcast_to(columns.lens.start + self._lens, (len(self._group), len(self._lens))))
         self._columns = np.concatenate([columns.pose(observations.frame), *free], 1)
+        self._known: tuple[State, Linear] | None = None  # of the last cost, whose derivatives are next
 
     def residual(self, state: State) -> Array:
         """(m, 2) residuals."""
@@ -57,14 +59,18 @@ class TrackTerm:
 
     def cost(self, state: State) -> float:
         """Robust cost, with what the model of the errors says of how far they repeat each other."""
+        self._known = state, self._linear(state)
+        residual = self._known[1][0].T
         if self._errors.tracks is None:
-            return float(self.costs(state).sum())
-        return self._errors.tracks.cost(self.residual(state))
+            return float(cauchy(residual, self._kernel)[0].sum())
+        return self._errors.tracks.cost(residual)
 
     def linearized(self, state: State) -> Term:
         """The weighted residuals and their derivatives at a state."""
         o, errors = self._observations, self._errors.tracks
-        residual, by_q, q, turn, shift = self._linear(state)
+        known, self._known = self._known, None
+        linear = known[1] if known is not None and known[0] is state else self._linear(state)
+        residual, by_q, q, turn, shift = linear
         weight = np.sqrt(cauchy(residual.T, self._kernel)[1]) if errors is None else errors.root_weight
         by_q *= weight
         by_camera = np.empty((self._columns.shape[1], 2, len(weight)))
@@ -87,7 +93,7 @@ class TrackTerm:
             errors,
         )
 
-    def _linear(self, state: State) -> tuple[Array, Array, Array, Array, Array]:
+    def _linear(self, state: State) -> Linear:
         """(2, m) residuals, their derivative (3, 2, m) by the points in the cameras, these (3, m), and the cameras:
         rotations (3, 3, m) and translations (3, m)."""
         o, sigma = self._observations, self._errors.sigma

@@ -50,13 +50,14 @@ def lens_covariances(adjustment: BundleAdjustment) -> list[Array]:
     pull at the lens.
     """
     columns = adjustment.columns.optics.start + adjustment.free_optics
-    whole = adjustment.marginals().camera
+    marginals = adjustment.marginals()
     inflation = adjustment.error_inflation()
-    o, influence = adjustment.observations, adjustment.influences(columns)
+    o, influence = adjustment.observations, adjustment.influences(marginals, columns)
     xy = adjustment.state.normalized(o)
     mean = np.stack([np.bincount(o.point, xy[:, i]) for i in range(2)], -1) / np.bincount(o.point)[:, None]
     parts = image_cells(mean, *_CELLS), np.arange(len(mean))
-    return [whole[np.ix_(columns, columns)] * inflation, *(_pulled_covariance(influence, part) for part in parts)]
+    whole = marginals.camera[np.ix_(columns, columns)] * inflation
+    return [whole, *(_pulled_covariance(influence, part) for part in parts)]
 
 
 def _pulled_covariance(influence: Array, part: Index) -> Array:

@@ -41,6 +41,7 @@ logger = logging.getLogger(__name__)
 _LONGEST = 1.5  # frames: the sensor has to be done before the next one, and an estimate has an error
 _LEAST_STEP = 0.03  # frames, of the first Newton step: a shorter readout does not matter
 _TURNING_GAIN = 10.0  # of translation, as in `Motion`, below which the camera may only turn
+_ROUGH = 1e-3  # relative decrease of the cost, with which few frames tell a clear translation from none
 _LEAST_EVIDENCE = 16.0  # squared standard deviations; an actor without a mask reaches 10
 _FEWEST, _ROUNDS = 12, 4  # least number of tracks for a field of accelerations; re-weightings
 _FITS = 5  # Gauss-Newton steps to the cameras of the recorded images, which are near
@@ -101,8 +102,8 @@ def with_sweep(
     """
     gaps = [1, *np.diff(recording.times).tolist(), 1]
     motion, acceleration, place = (np.zeros_like(observations.pixels) for _ in range(3))
-    for k, position in enumerate(frames):
-        rows = np.nonzero(observations.frame == k)[0]
+    by_frame = observations.rows_by_frame(len(frames))
+    for k, (position, rows) in enumerate(zip(frames, by_frame, strict=True)):
         ids = tracks[observations.point[rows]]
         before, here, after = (float(focal[k]) * _seen(images, position + step, ids) for step in (-1, 0, 1))
         velocities = (here - before) / gaps[position], (after - here) / gaps[position + 1]
@@ -174,7 +175,8 @@ def turns_before_shutter(adjustment: BundleAdjustment, motion: Motion, options: 
     if motion.gain >= _TURNING_GAIN:
         return None
     _, few, _ = some_frames(motion.rotation_only, adjustment.observations)
-    if _turning(on_some_frames(adjustment), few, options, CLEAR_GAIN) is None:
+    rough = replace(options, polish=replace(options.polish, tolerance=_ROUGH))
+    if _turning(on_some_frames(adjustment), few, rough, CLEAR_GAIN) is None:
         return None
     return _turning(adjustment, motion.rotation_only, options, LEAST_GAIN)
 

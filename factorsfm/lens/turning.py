@@ -62,9 +62,8 @@ def _chained(guess: State, observations: Observations) -> State:
     xy = guess.normalized(o)
     ray = np.column_stack([xy, np.ones(len(xy))])
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-    rows = np.argsort(o.frame, kind="stable")
     rotation, seen = np.tile(np.eye(3), (count, 1, 1)), np.zeros((len(guess.bearing), 3))
-    for k, here in enumerate(np.split(rows, np.searchsorted(o.frame[rows], np.arange(1, count)))):
+    for k, here in enumerate(o.rows_by_frame(count)):
         before = seen[o.point[here]]
         length = np.linalg.norm(before, axis=1)
         known = length > 0

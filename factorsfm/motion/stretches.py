@@ -96,5 +96,7 @@ def _kind_of_frames(solved: BundleAdjustment, first: int, end: int, options: Pol
     part = solved.state.seen_from(first).of(points).in_frames(np.arange(first, end))
     few = o.at(rows, frame=o.frame[rows] - first, point=point)
     alone = BundleAdjustment(part, few, options, solved.errors)
+    if (kind := classify_motion(alone, options).kind) is ShotKind.GENERAL:  # even with the poses of the whole shot
+        return kind
     alone.solve(_ITERATIONS)
     return classify_motion(alone, options).kind

@@ -29,6 +29,7 @@ logger = logging.getLogger(__name__)
 
 _DOUBTFUL_INFLATION = 8.0  # see `error_inflation`; right solutions have 1 to 6, wrong ones 13 to 80
 _CLEARLY = 0.9  # of the cost of the solution from the incremental map, below which another one is preferred
+_ROUGH = 1e-3  # relative decrease of the cost with which a try ends: the right one costs far less than the others
 _ROUNDS = 3  # in which what moves is left out
 _CORE_TRACKS = 400  # on which the cameras are solved first
 _CELLS, _CELL_TRACKS = (8, 5), 10  # across and down, and the tracks of each that take part at least
@@ -67,17 +68,27 @@ def best_solution(start: State, few: Observations, options: Options) -> CameraSo
             logger.info("%d of %d points do not move in the image and are left out", static.sum(), len(static))
             kept, start, few, best = others, start.of(others), alone.observations, alone
     found = _without_moving(best, options)
+    rough = replace(options, polish=replace(options.polish, tolerance=_ROUGH))
     if is_doubtful(found.adjustment, options):
         logger.info("the solution does not fit (%.2f px), trying what turns together", found.adjustment.sigma)
-        found = _of_one_group(found, start, few, options)
+        found = _converged(_of_one_group(found, start, few, rough), found, options)
     if is_doubtful(found.adjustment, options):
         logger.info("the solution does not fit (%.2f px), trying other starts", found.adjustment.sigma)
-        for other in (start, flat(start, few, options.polish)):
-            found = _better(found, on_what_fits(other, few, options), few)
+        first = found
+        for other in (start, flat(start, few, rough.polish)):
+            found = _better(found, on_what_fits(other, few, rough), few)
         best = found.adjustment
-        mirrored = solution_from(reversed_scene(best.state), best.observations, options.polish)
-        found = _better(found, replace(found, adjustment=mirrored), few)
+        mirrored = solution_from(reversed_scene(best.state), best.observations, rough.polish)
+        found = _converged(_better(found, replace(found, adjustment=mirrored), few), first, options)
     return replace(found, kept=kept[found.kept])
+
+
+def _converged(found: CameraSolution, known: CameraSolution, options: Options) -> CameraSolution:
+    """A solution that was found roughly, unless it is the known one."""
+    if found is known:
+        return found
+    rough = found.adjustment
+    return replace(found, adjustment=solution_from(rough.state, rough.observations, options.polish))
 
 
 def is_doubtful(solved: BundleAdjustment, options: Options) -> bool:

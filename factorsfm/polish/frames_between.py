@@ -8,22 +8,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
-from factorsfm.adjustment.noise import SMALLEST_SIGMA_PX
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import ErrorModel
 from factorsfm.adjustment.residuals import cauchy
+from factorsfm.adjustment.state import State
 from factorsfm.lens.lens import Lens, LensEstimate
-from factorsfm.lens.turning import turn_to
 from factorsfm.mapping.mapped_images import MappedImage
-from factorsfm.mapping.registration import register_image
 from factorsfm.polish.polished import Polished
+from factorsfm.polish.pose_on_points import Pose, poses_on_points
 from factorsfm.polish.shot import Shot
 from factorsfm.support.options import Options
 from factorsfm.support.status import ShotKind
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-Pose = tuple[Array, Array]
 
 
 def solved_frames(images: list[MappedImage], registered: list[int], limit: int) -> list[int]:
@@ -54,7 +52,7 @@ def add_frames_between(result: Polished, shot: Shot, registered: list[int], opti
     seen = shot.observations(registered, result.tracks)
     if result.shutter is not None:
         seen = shot.swept(seen, registered, result.tracks)
-    poses = _registered_between(result, registered, seen, cameras.normalized(seen), cameras.focal, options)
+    poses = _registered_between(result, shot, registered, seen, cameras, options)
     _insert(result, poses, registered, group, seen, options)
 
 
@@ -68,46 +66,30 @@ def _zoom_at(lens: LensEstimate, frames: list[int], wanted: Index) -> LensEstima
 
 
 def _registered_between(
-    result: Polished, registered: list[int], seen: Observations, xy: Array, focal: Array, options: Options
+    result: Polished, shot: Shot, registered: list[int], seen: Observations, cameras: State, options: Options
 ) -> dict[int, Pose]:
     """Poses by position, those of the result among them.
 
     Args:
-        seen: in the registered frames; xy: (m, 2) normalised; focal: (registered,) pixels.
+        seen: in the registered frames; cameras: with the lens of these.
     """
-    state, m, solved = result.state, options.mapper, np.array(result.frames)
-    points = state.points
+    least, state = options.mapper.min_inliers, result.state
     poses = {f: (state.rotation[k], state.translation[k]) for k, f in enumerate(result.frames)}
-    for row, f in enumerate(registered):
-        if f in poses:
-            continue
-        mine = np.nonzero(seen.frame == row)[0]
-        if len(mine) < m.min_inliers:
-            result.left_out[f] = too_few_tracks(len(mine), m.min_inliers)
-            continue
-        near = poses[int(solved[np.argmin(np.abs(solved - f))])]
-        if result.motion.kind is ShotKind.GENERAL:
-            found = register_image(
-                points[seen.point[mine]], xy[mine], *near,
-                focal=float(focal[row]), sigma=max(result.sigma, SMALLEST_SIGMA_PX), inlier_px=m.inlier_px,
-            )  # fmt: skip
-            pose, inliers = (found.rotation, found.translation), int(found.inliers.sum())
+    between = poses_on_points(
+        state, np.searchsorted(registered, result.frames), seen, cameras, shot.turns(registered),
+        moves=result.motion.kind is ShotKind.GENERAL, sigma=result.sigma, options=options.mapper,
+    )  # fmt: skip
+    for found in between:
+        position = registered[found.row]
+        if found.tracks < least:
+            result.left_out[position] = too_few_tracks(found.tracks, least)
+        elif found.inliers < least:
+            result.left_out[position] = (
+                f"{found.inliers} of {least} needed inliers among {found.tracks} tracks of the polish"
+            )
         else:
-            pose, inliers = _turned(state.bearing[seen.point[mine]], xy[mine], near[0], float(focal[row]), m.inlier_px)
-        if inliers >= m.min_inliers:
-            poses[f] = pose
-        else:
-            result.left_out[f] = f"{inliers} of {m.min_inliers} needed inliers among {len(mine)} tracks of the polish"
+            poses[position] = found.pose
     return poses
-
-
-def _turned(bearing: Array, xy: Array, near: Array, focal: float, inlier_px: float) -> tuple[Pose, int]:
-    """The pose of a camera that does not translate, and the number of its inliers."""
-    ray = np.column_stack([xy, np.ones(len(xy))])
-    rotation = turn_to(bearing, ray / np.linalg.norm(ray, axis=1, keepdims=True), near, focal)
-    q = bearing @ rotation.T
-    error = focal * np.linalg.norm(q[:, :2] / q[:, 2:] - xy, axis=1)
-    return (rotation, np.zeros(3)), int(((error < inlier_px) & (q[:, 2] > 0.0)).sum())
 
 
 def _insert(

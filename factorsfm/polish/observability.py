@@ -120,5 +120,5 @@ def pixel_slide(covariance: Array, depth: Array, focal: Array | float) -> Array:
 
 
 def _median_by_frame(values: Array, observations: Observations, frames: int) -> Array:
-    by_frame = (values[observations.frame == k] for k in range(frames))
+    by_frame = (values[rows] for rows in observations.rows_by_frame(frames))
     return np.array([np.median(mine) if len(mine) else np.nan for mine in by_frame])

@@ -81,6 +81,10 @@ class Shot:
         """Those of some images."""
         return [self.images[position].tracks for position in frames]
 
+    def turns(self, frames: Sequence[int]) -> Array:
+        """(k, 3, 3) rotations of some registered images in the map."""
+        return np.array([self.images[position].pose[0] for position in frames])
+
     def long_tracks(self, frames: Sequence[int], least: int) -> Index:
         """Ids (ascending) of the tracks that at least so many of the images see; of the supervised ones, two."""
         tracks = self.tracks(frames)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import FocalPrior, Free
-from factorsfm.adjustment.some_frames import some_frames
+from factorsfm.adjustment.some_frames import seen_in, some_frames
 from factorsfm.adjustment.state import State
 from factorsfm.lens.estimate import estimate_lens
 from factorsfm.lens.lens import LensEstimate, observed_width, shape_sigmas, through
@@ -25,6 +25,7 @@ from factorsfm.motion.readings import Reading, solution_from
 from factorsfm.motion.shot_kind import Motion, classify_motion
 from factorsfm.motion.suspects import agreeing
 from factorsfm.polish.camera_starts import best_solution, core_tracks, is_doubtful, on_what_fits
+from factorsfm.polish.core_frames import core_frames, in_all_frames
 from factorsfm.polish.near_and_far import NearAndFar, near_and_far
 from factorsfm.polish.shot import Shot
 from factorsfm.polish.simple_readings import turning_reading, unless_at_rest
@@ -94,7 +95,7 @@ def polish_start(
         frames: positions of the registered images; observations, tracks: theirs.
     """
     progress("polish: cameras")
-    core = _solved_core(shot, frames, observations, tracks, options)
+    core = _core(shot, frames, observations, tracks, options)
     inflation, general = core.adjustment.error_inflation(), core.motion.kind is ShotKind.GENERAL
     depths = NearAndFar(core.adjustment)
     if general:
@@ -105,6 +106,35 @@ def polish_start(
     part = core.adjustment.state if general else core.motion.rotation_only
     state, observations, tracks, moving = _with_fitting_tracks(part, core, observations, tracks, shot, options.polish)
     return PolishStart(state, observations, tracks, core.adjustment.sigma, inflation, depths, core, moving)
+
+
+def _core(shot: Shot, frames: list[int], observations: Observations, tracks: Index, options: Options) -> Core:
+    """Cameras, lens and shutter on the longest tracks; of a long shot on few of the frames first."""
+    rows = core_frames(observations, len(frames)) if shot.in_time else np.arange(len(frames))
+    if len(rows) < len(frames):
+        few, points = seen_in(rows, observations)
+        core = _solved_core(shot, [frames[row] for row in rows], few, tracks[points], options)
+        if core.lens is None or not core.lens.zooms:  # between two frames, a zoom may change its speed
+            core = replace(core, points=points[core.points], left_out=points[core.left_out])
+            return _in_all_frames(core, rows, shot, frames, observations, options)
+    return _solved_core(shot, frames, observations, tracks, options)
+
+
+def _in_all_frames(
+    core: Core, rows: Index, shot: Shot, frames: list[int], observations: Observations, options: Options
+) -> Core:
+    """The core of some frames with all of them; `rows`: of its frames."""
+    adjustment, seen = core.adjustment, observations.of(core.points)
+
+    def all_frames(state: State, *, moves: bool) -> State:
+        return in_all_frames(
+            state, rows, seen, shot.group[frames], shot.turns(frames),
+            moves=moves, sigma=adjustment.sigma, options=options.mapper,
+        )  # fmt: skip
+
+    state = all_frames(adjustment.state, moves=True)
+    motion = replace(core.motion, rotation_only=all_frames(core.motion.rotation_only, moves=False))
+    return replace(core, adjustment=BundleAdjustment(state, seen, options.polish, adjustment.errors), motion=motion)
 
 
 def _solved_core(shot: Shot, frames: list[int], observations: Observations, tracks: Index, options: Options) -> Core:

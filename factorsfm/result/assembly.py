@@ -158,17 +158,18 @@ def _observations_of(polished: Polished, images: Sequence[MappedImage], points: 
     row_of = np.full(len(polished.state.inverse_distance), -1)
     row_of[points] = np.arange(len(points))
     keep = row_of[o.point] >= 0
-    positions = np.array(polished.frames)[o.frame[keep]]
-    ids = polished.tracks[o.point[keep]]
+    kept = o.at(keep)
+    positions = np.array(polished.frames)[kept.frame]
+    ids = polished.tracks[kept.point]
     xy = np.empty((len(positions), 2))
-    for position in np.unique(positions):
-        mine, tracks = positions == position, images[position].tracks
+    for position, mine in zip(polished.frames, kept.rows_by_frame(len(polished.frames)), strict=True):
+        tracks = images[position].tracks
         xy[mine] = tracks.pixels[np.searchsorted(tracks.ids, ids[mine])]
     residual, residual_sigma = (relative[keep] for relative in _prior_residuals(polished))
     shift = 0.0 if polished.prior is None else polished.prior.observations.shift_sigma
     noise = ObservationNoise(polished.observation_sigma[keep], polished.track_sigma[points], residual_sigma, shift)
     rolled = None if polished.rolled is None else polished.rolled[keep]
-    return _Observations(positions, row_of[o.point[keep]], xy, polished.errors[keep], residual, noise, rolled)
+    return _Observations(positions, row_of[kept.point], xy, polished.errors[keep], residual, noise, rolled)
 
 
 def _prior_residuals(polished: Polished) -> tuple[Array, Array]:

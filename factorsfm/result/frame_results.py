@@ -7,6 +7,7 @@ from typing import Protocol
 
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 
 from factorsfm.camera.projection import with_focal
 from factorsfm.mapping.mapped_images import MappedImage
@@ -44,6 +45,7 @@ def frame_results(
         unit: length of one unit of the polish in the result.
     """
     row_of = {position: row for row, position in enumerate(polished.frames)}
+    by_frame = polished.observations.rows_by_frame(len(polished.frames))
     results = []
     for position, (frame, image) in enumerate(zip(frames, images, strict=True)):
         result = FrameResult(
@@ -56,8 +58,9 @@ def frame_results(
             observations=len(image.tracks.ids),
         )
         if position in row_of:
-            _add_solution(result, polished, row_of[position], camera, unit)
-            result.prior = _prior_fit(polished, images, row_of[position], unit)
+            row = row_of[position]
+            _add_solution(result, polished, row, polished.errors[by_frame[row]], camera, unit)
+            result.prior = _prior_fit(polished, images, row, unit)
         elif position in polished.left_out:
             result.status, result.message = FrameStatus.TOO_FEW_INLIERS, polished.left_out[position]
             result.keyframe = False
@@ -65,11 +68,13 @@ def frame_results(
     return results
 
 
-def _add_solution(result: FrameResult, polished: Polished, row: int, camera: pycolmap.Camera, unit: float) -> None:
+def _add_solution(
+    result: FrameResult, polished: Polished, row: int, errors: NDArray[np.float64], camera: pycolmap.Camera, unit: float
+) -> None:
     """Add pose, covariance, lens and inliers of a camera.
 
     Args:
-        row: of the camera in the polish.
+        row: of the camera in the polish; errors: of its observations, pixels.
     """
     state, lens = polished.state, polished.lens
     rotation = pycolmap.Rotation3d(state.rotation[row])
@@ -83,7 +88,6 @@ def _add_solution(result: FrameResult, polished: Polished, row: int, camera: pyc
         result.camera = with_focal(camera, float(state.focal[row]))
         if lens is not None and lens.determined:
             result.focal_std = float(lens.focal_std[state.group[row]])
-    errors = polished.errors[polished.observations.frame == row]
     threshold = _INLIER_SIGMAS * polished.sigma
     result.inliers = int((errors < threshold).sum())
     result.reprojection_error = float(np.median(errors))

@@ -15,6 +15,7 @@ Array = NDArray[np.float64]
 
 # Of a matrix with a unit diagonal: smaller eigenvalues are rounding errors of the elimination.
 _LEAST_EIGENVALUE = 1e-12
+_BLOCK = 96  # rows of a triangular matrix that are solved for at once, as if it were full
 _NOTHING = 1e-100  # information; its inverse is still a number, and so is its square
 
 
@@ -39,7 +40,9 @@ def covariance_of(information: Array) -> Array:
         return _by_spectrum(information, _large_inverse)
     if not np.isfinite(root).all():
         return _by_spectrum(information, _large_inverse)
-    half = np.linalg.solve(root, np.eye(information.shape[-1]))  # its square has no negative eigenvalues
+    half = triangular_solution(
+        np.asarray(root, np.float64), np.eye(information.shape[-1])
+    )  # its square has no negative eigenvalues
     return np.asarray(half.swapaxes(-1, -2) @ half)
 
 
@@ -65,8 +68,15 @@ def covariance_and_root(information: Array) -> tuple[Array, Array]:
 
 
 def triangular_solution(root: Array, values: Array) -> Array:
-    """``root^-1 values`` of a triangular matrix without a zero on its diagonal, as `root_of` gives it."""
-    return np.asarray(np.linalg.solve(root, values))
+    """``root^-1 values`` of a lower triangular matrix without a zero on its diagonal, as `root_of` gives it."""
+    size = root.shape[-1]
+    if size <= _BLOCK or root.ndim > 2:
+        return np.asarray(np.linalg.solve(root, values))
+    found = np.empty(values.shape)
+    for begin in range(0, size, _BLOCK):
+        here = slice(begin, begin + _BLOCK)
+        found[here] = np.linalg.solve(root[here, here], values[here] - root[here, :begin] @ found[:begin])
+    return found
 
 
 def deviations(covariance: Array) -> Array:

@@ -15,6 +15,7 @@ from factorsfm.support.semidefinite import (
     root_of,
     solution,
     squared_deviations,
+    triangular_solution,
 )
 
 
@@ -52,6 +53,14 @@ def test_a_determined_system_is_solved_as_it_is():
     gradient = np.array([1.0, -2.0, 3.0])
     np.testing.assert_array_equal(solution(information, gradient), np.linalg.solve(information, gradient))
     np.testing.assert_allclose(covariance_of(information), np.linalg.inv(information), rtol=1e-9)
+
+
+@pytest.mark.parametrize("values", [(), (3,)])
+def test_a_large_triangle_is_solved_block_by_block(values):
+    rng = np.random.default_rng(2)
+    root = np.tril(rng.standard_normal((250, 250))) + 20.0 * np.eye(250)
+    wanted = rng.standard_normal((250, *values))
+    np.testing.assert_allclose(triangular_solution(root, root @ wanted), wanted, rtol=0.0, atol=1e-12)
 
 
 def test_evidence_from_few_samples_is_not_negative():
