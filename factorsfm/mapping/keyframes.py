@@ -42,7 +42,7 @@ def is_keyframe(
     )
 
 
-def suddenly_rough(image: MappedImage, before: Sequence[MappedImage]) -> bool:
+def suddenly_rough(image: MappedImage, before: Sequence[MappedImage], count: int) -> bool:
     """Whether a registered image fits the map far worse than those just before it.
 
     Fewer of its tracks agree, and not as well. A damaged, blurred or flashed image passes, and must not bend the map.
@@ -50,9 +50,11 @@ def suddenly_rough(image: MappedImage, before: Sequence[MappedImage]) -> bool:
 
     Args:
         before: all images before it, in order of time.
+        count: of the keyframes so far. With one, the map has the shape that the prior guessed, and all images are rough
+            from the first parallax on.
     """
     lately = [other for other in before[-_LATELY:] if other.registered]
-    if not lately:
+    if not lately or count < 2:
         return False
     best = min(lately, key=lambda other: other.threshold)
     share = image.inliers / len(image.tracks.ids)

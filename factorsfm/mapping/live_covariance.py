@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.mapping.mapped_images import MappedImage
+from factorsfm.mapping.mapped_images import MappedImage, nearest_registered
 from factorsfm.support.rotations import cross_matrices
 
 Array = NDArray[np.float64]
@@ -19,32 +19,29 @@ _SAME_PLACE = 0.02  # of the camera's displacement: keyframes nearer than that t
 
 
 def live_covariance(
-    pose: tuple[Array, Array],
-    on_map: Array,
-    keyframes: Sequence[MappedImage],
-    doubted_from: tuple[Array, Array] | None = None,
+    image: MappedImage, on_map: Array, images: Sequence[MappedImage], keyframes: Sequence[int]
 ) -> Array:
     """(6, 6) of a pose that was just registered (`FrameResult.covariance`).
 
     Args:
-        pose: rotation (3, 3) and translation (3,), cam_from_world.
         on_map: (6, 6) what is uncertain where the map is exact.
-        keyframes: those whose covariance the graph has given: what the map itself leaves open.
-        doubted_from: the pose beside it in time, where the image is rough: the whole step from there is in doubt.
+        images: all; keyframes: positions of those whose covariance the graph may have given: what the map leaves open.
     """
-    rotation, translation = pose
-    if doubted_from is not None:
-        turn = rotation @ doubted_from[0].T
-        step = np.concatenate([cv2.Rodrigues(turn)[0].ravel(), translation - turn @ doubted_from[1]])
+    rotation, translation = image.pose
+    if image.rough:  # the whole step from the image beside it is in doubt
+        beside = nearest_registered(images, image.tracks.position).pose
+        turn = rotation @ beside[0].T
+        step = np.concatenate([cv2.Rodrigues(turn)[0].ravel(), translation - turn @ beside[1]])
         on_map = on_map + np.outer(step, step)
+    solved = [images[k] for k in keyframes if images[k].covariance is not None]
     # What linearised covariances do not know of a young map: that its whole shape is still a guess.
-    places = _places(keyframes, -rotation.T @ translation)
+    places = _places(solved, -rotation.T @ translation)
     bent = _YOUNG_ERROR * float(np.linalg.norm(translation)) / places**2
     on_map = on_map + bent**2 * np.eye(6)
-    if len(keyframes) < 2:
+    if len(solved) < 2:
         return on_map
-    assert keyframes[-1].covariance is not None
-    return on_map + carried(keyframes[-1].covariance, keyframes[-1].pose, pose)
+    assert solved[-1].covariance is not None
+    return on_map + carried(solved[-1].covariance, solved[-1].pose, image.pose)
 
 
 def window_covariance(pose: tuple[Array, Array], given: Array, constant: Sequence[MappedImage]) -> Array:

@@ -42,9 +42,7 @@ Index = NDArray[np.int64]
 
 logger = logging.getLogger(__name__)
 
-_STATE = (
-    "focal", "first_focal", "keyframes", "new_points", "parallax", "started", "unit", "_due",
-)  # fmt: skip
+_STATE = ("focal", "first_focal", "keyframes", "new_points", "parallax", "started", "unit", "_due")
 _RUNNING_OUT = 0.5  # share of an image's tracks with a point, below which the map is extended at once
 _SETTLED, _SETTLED_DELAY = 5, 2  # keyframes of a map that changes little; frames that it waits longer for the graph
 
@@ -310,11 +308,8 @@ class Mapper(IncrementalMapper):
 
     def _accept(self, image: MappedImage, found: Registration) -> None:
         super()._accept(image, found)
-        solved = [self.images[k] for k in self.keyframes if self.images[k].covariance is not None]
-        # A map of one keyframe has the shape that the prior guessed: all images are rough from the first parallax on.
-        image.rough = len(self.keyframes) > 1 and suddenly_rough(image, self.images[: image.tracks.position])
-        near = nearest_registered(self.images, image.tracks.position).pose if image.rough else None
-        image.covariance = live_covariance(image.pose, found.covariance, solved, near)
+        image.rough = suddenly_rough(image, self.images[: image.tracks.position], len(self.keyframes))
+        image.covariance = live_covariance(image, found.covariance, self.images, self.keyframes)
         inverse = self.points.inverse_depths(image, found.inliers)
         if len(inverse):  # the first camera is the world
             moved = np.stack([np.zeros(3), image.pose[0].T @ image.pose[1]])
@@ -324,10 +319,6 @@ class Mapper(IncrementalMapper):
         """Leave some tracks out of the images before the newest, which the graph may be working on."""
         for image in self.images[:-1]:
             image.forget_tracks(ids)
-
-    def forget_unseen_points(self) -> None:
-        """Leave out the points that no image sees."""
-        self.points.keep(np.concatenate([image.tracks.ids for image in self.images]))
 
     # --- keyframes and landmarks --------------------------------------------------------------------------------
 

@@ -72,7 +72,7 @@ class Horizon:
             if image.tracks.position not in stay and len(image.tracks.ids):
                 image.tracks = replace(image.tracks.of(np.zeros(0, np.intp)), depth=None)
         relocalizer.keep([view for view in relocalizer.views if view.position >= self.begin or view.position in stay])
-        mapper.forget_unseen_points()
+        mapper.points.keep(np.concatenate([image.tracks.ids for image in mapper.images]))
 
     def _choose_views(self, mapper: Mapper, left: Sequence[int]) -> None:
         """Of the keyframes that have just left, those that show something new."""
