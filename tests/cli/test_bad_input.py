@@ -490,7 +490,7 @@ def test_good_footage_through_the_command_line_after_bad(cli: Cli) -> None:
         assert captured.err == ""
         assert "all 5 frames registered" in captured.out
         names = {path.name for path in cli.output.iterdir()}
-        assert names == {"colmap", "points.ply", "report.html", "summary.json", "trajectory.tum"}
+        assert names == {"colmap", "points.ply", "report.html", "summary.json", "tracks.npz", "trajectory.tum"}
     assert len((cli.output / "trajectory.tum").read_text().splitlines()) == 5
 
 

@@ -160,7 +160,7 @@ def test_a_result_that_was_read_back_has_robust_observations_and_no_prior(tmp_pa
     r.write(tmp_path)
     back = read_result(tmp_path)
     graph, values = factor_graph(back)
-    assert set(values.keys()) == {X(i) for i in range(FRAMES)} | {L(j) for j in range(len(r.points))} | {T(0)}
+    assert set(values.keys()) == {X(i) for i in range(FRAMES)} | {L(j) for j in r.track_ids.tolist()} | {T(0)}
     projections = factors_of(graph, *PROJECTIONS)
     assert len(projections) == len(r.observation_xy)
     assert all(isinstance(factor.noiseModel(), gtsam.noiseModel.Robust) for factor in projections)
