@@ -6,6 +6,9 @@ from pathlib import Path
 
 import pytest
 
+# Before NumPy is imported: the workers share the cores, and threads of BLAS would wait for each other in each of them.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 SHARED = Path(os.environ.get("FACTORSFM_SHARED", Path(__file__).resolve().parents[2] / "shared"))
 
 
