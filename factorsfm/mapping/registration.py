@@ -213,7 +213,7 @@ def _refine(
     inliers = error < threshold
     typical = float(np.median(error[inliers])) if inliers.any() else float("inf")
     covariance = covariance_of(information + 1e-9 * np.diag(information.diagonal() + 1e-12))
-    if threshold > inlier_px:  # what is wrong then is not noise: errors of neighbours are alike
+    if threshold > inlier_px and inliers.any():  # what is wrong then is not noise: errors of neighbours are alike
         q = points[inliers] @ rotation.T + translation
         vectors = focal * (q[:, :2] / q[:, 2:] - observed[inliers])
         covariance *= block_inflation(vectors, np.zeros(len(vectors), np.int64), observed[inliers])
