@@ -121,6 +121,13 @@ def test_nonsense_finds_few_inliers():
     assert register_image(points, shuffled, *near(), **SETTINGS).inliers.sum() < 8
 
 
+def test_where_nothing_agrees_there_is_no_inlier():
+    points, observed = view(4)
+    result = register_image(points, observed + 1e4 * np.arange(1, 5)[:, None], *near(), **SETTINGS)
+    assert not result.inliers.any()
+    assert np.isfinite(result.covariance).all()
+
+
 # --- the optimum ------------------------------------------------------------------------------------------------
 
 
