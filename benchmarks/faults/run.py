@@ -100,7 +100,7 @@ def _target(plan: Plan, snapshot: Path | None, data: Path | None) -> tuple[Strea
     """What the frames are pushed to, new or from a snapshot that exists, and the first frame to push."""
     if snapshot is not None and snapshot.exists():
         stream = Stream.load(snapshot, depth=FaultyPrior(plan))
-        return stream, stream.frames[-1].index + 1
+        return stream, stream.newest.index + 1
     options = Options()
     if data is None:
         options = replace(options, tracker=replace(options.tracker, max_tracks=_RENDERED_TRACKS))

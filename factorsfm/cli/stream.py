@@ -252,7 +252,7 @@ def _after(source: Source, stream: Stream | None, name: str) -> Iterator[Frame]:
     if stream is None or not stream.frames:
         yield from source
         return
-    last = stream.frames[-1]
+    last = stream.newest
     if Path(name).exists():
         yield from (frame for frame in source if frame.index > last.index)
         return

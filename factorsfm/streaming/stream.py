@@ -26,6 +26,7 @@ from factorsfm.priors.image_depth import ImageDepth
 from factorsfm.priors.masks import MaskPrior
 from factorsfm.priors.read_priors import read_mask
 from factorsfm.report.thumbnails import Thumbnails
+from factorsfm.result.frame_results import SourceFrame
 from factorsfm.result.lost_frames import with_large_steps
 from factorsfm.result.reconstruction import Reconstruction
 from factorsfm.result.repeats import add_recorded, add_results
@@ -76,12 +77,6 @@ class Stream(Closing):
             letters v, b and g of variables are taken.
         horizon: number of frames that `finish` polishes; those before keep their live poses, and of what they saw what
             finds their view again. None is all; control, an IMU and factors of the caller also keep all.
-
-    Example:
-        >>> stream = factorsfm.Stream(camera, depth=factorsfm.DepthModel("model.onnx"))  # doctest: +SKIP
-        >>> for frame in factorsfm.read_frames("shot.mp4"):  # doctest: +SKIP
-        ...     update = stream.push(frame)
-        >>> reconstruction = stream.finish()  # doctest: +SKIP
     """
 
     def __init__(
@@ -242,6 +237,12 @@ class Stream(Closing):
         return self._footage.recorded.with_repeats([image.tracks for image in images])
 
     @property
+    def newest(self) -> SourceFrame:
+        """The frame that came last, also where it repeats the one before; there must be one."""
+        last: list[SourceFrame] = [*self.frames[-1:], *self._footage.repeats[-1:]]
+        return max(last, key=lambda frame: frame.index)
+
+    @property
     def track_ids(self) -> NDArray[np.int64]:
         """(n,) of the `tracks` of the newest frame: the j of ``L(j)`` where the map holds them."""
         images = self._mapper.images if self._mapper is not None else []
@@ -279,7 +280,7 @@ class Stream(Closing):
         cls, path: str | Path, *,
         depth: DepthPrior | None = None, masks: MaskPrior | None = None, imu: ImuRecording | None = None,
     ) -> Stream:  # fmt: skip
-        """Go on where a stream was saved; the next frame to push is number `len(stream.frames)`.
+        """Go on where a stream was saved, with the frame after `newest`.
 
         Args:
             path: of the snapshot; depth, masks, imu: the priors and the recording that the stream had.

@@ -115,3 +115,16 @@ def test_a_snapshot_keeps_arrays_exactly(tmp_path: Path) -> None:
     for array, read in zip(arrays, read_snapshot(tmp_path / "state")["arrays"], strict=True):
         assert read.dtype == array.dtype
         np.testing.assert_array_equal(read, array)
+
+
+def test_a_stream_goes_on_after_a_frame_that_repeats_another(tmp_path: Path) -> None:
+    shot = render_shot("truck", 10, 160, 96)
+    with Stream(shot.camera) as stream:
+        for index, k in enumerate([*range(9), 8]):
+            stream.push(factorsfm.Frame(index, shot.images[k], f"{index}"))
+        stream.save(tmp_path / "state")
+    with Stream.load(tmp_path / "state") as stream:
+        assert len(stream.frames) == 9
+        assert stream.newest.index == 9
+        stream.push(factorsfm.Frame(10, shot.images[9], "10"))
+        assert stream.newest.index == 10
