@@ -42,18 +42,19 @@ def is_keyframe(
     )
 
 
-def suddenly_rough(image: MappedImage, before: Sequence[MappedImage], count: int) -> bool:
+def suddenly_rough(image: MappedImage, images: Sequence[MappedImage], count: int) -> bool:
     """Whether a registered image fits the map far worse than those just before it.
 
     Fewer of its tracks agree, and not as well. A damaged, blurred or flashed image passes, and must not bend the map.
     Where the map itself is wrong, the images stay rough, and one of them becomes a keyframe.
 
     Args:
-        before: all images before it, in order of time.
+        images: all, in order of time, at least those before it.
         count: of the keyframes so far. With one, the map has the shape that the prior guessed, and all images are rough
             from the first parallax on.
     """
-    lately = [other for other in before[-_LATELY:] if other.registered]
+    position = image.tracks.position
+    lately = [other for other in images[max(0, position - _LATELY) : position] if other.registered]
     if not lately or count < 2:
         return False
     best = min(lately, key=lambda other: other.threshold)

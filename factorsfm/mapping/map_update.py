@@ -27,6 +27,7 @@ from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.mapping.prior_check import inconsistency
 from factorsfm.mapping.young_map import YOUNG_KEYFRAMES, burn_ins_of, lifted_anew, resting_among, scene_alone
 from factorsfm.support.options import PolishOptions
+from factorsfm.support.similarity import covariance_in_unit
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -146,11 +147,12 @@ def judged(copy: MapCopy, images: list[MappedImage], result: UpdateResult) -> Ma
     if (d := window.depths) is not None:
         guided = [images[row].tracks.position for row in d.image]
         affines = dict(zip(guided, zip(d.scale.tolist(), d.shift.tolist(), strict=True), strict=True))
-    units = np.array([1.0, 1.0, 1.0, unit, unit, unit])
     position = {image.tracks.frame: image.tracks.position for image in images}
     constant = [image for image, held in zip(images, window.constant, strict=True) if held]
     covariances = {
-        position[k]: window_covariance(poses[position[k]], _COVARIANCE_INFLATION * c * np.outer(units, units), constant)
+        position[k]: window_covariance(
+            poses[position[k]], covariance_in_unit(_COVARIANCE_INFLATION * c, unit), constant
+        )
         for k, c in result.covariance.items()
     }
     errors, depth = window.reprojection()

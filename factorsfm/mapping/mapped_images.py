@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from factorsfm.adjustment.state import State
 from factorsfm.camera.projection import with_focal
+from factorsfm.support.similarity import covariance_in_unit
 from factorsfm.support.status import FrameStatus
 from factorsfm.tracks.image_tracks import ImageTracks
 
@@ -64,8 +65,7 @@ class MappedImage:
         if self.affine is not None:
             self.affine = unit * self.affine[0], self.affine[1]
         if self.covariance is not None:
-            units = np.repeat([1.0, unit], 3)
-            self.covariance = self.covariance * np.outer(units, units)
+            self.covariance = covariance_in_unit(self.covariance, unit)
 
     def take_up_tracks(self, ids: Index, pixels: Array) -> None:
         """Observe further tracks.

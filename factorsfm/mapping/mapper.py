@@ -308,7 +308,7 @@ class Mapper(IncrementalMapper):
 
     def _accept(self, image: MappedImage, found: Registration) -> None:
         super()._accept(image, found)
-        image.rough = suddenly_rough(image, self.images[: image.tracks.position], len(self.keyframes))
+        image.rough = suddenly_rough(image, self.images, len(self.keyframes))
         image.covariance = live_covariance(image, found.covariance, self.images, self.keyframes)
         inverse = self.points.inverse_depths(image, found.inliers)
         if len(inverse):  # the first camera is the world

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from factorsfm.objects.object_result import ObjectFrame, ObjectResult
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.support.errors import InputError
-from factorsfm.support.similarity import Similarity
+from factorsfm.support.similarity import Similarity, covariance_in_unit
 
 Array = NDArray[np.float64]
 
@@ -57,10 +57,7 @@ def _frame(frame: FrameResult, scale: float, old_from_new: pycolmap.Rigid3d) -> 
 
 def _scaled(covariance: Array | None, scale: float) -> Array | None:
     """A covariance of rotation and translation, in the axes of the camera, in another unit."""
-    if covariance is None:
-        return None
-    units = np.repeat([1.0, scale], 3)
-    return np.asarray(covariance * np.outer(units, units))
+    return None if covariance is None else covariance_in_unit(covariance, scale)
 
 
 def _object(thing: ObjectResult, world: Similarity) -> ObjectResult:

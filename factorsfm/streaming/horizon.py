@@ -23,7 +23,7 @@ from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.streaming.frame_update import SeenFrame, frame_results
 from factorsfm.streaming.relocalization import Relocalizer
 from factorsfm.support.errors import InputError
-from factorsfm.support.similarity import Similarity, pose_arrays
+from factorsfm.support.similarity import Similarity, covariance_in_unit, pose_arrays
 
 Array = NDArray[np.float64]
 
@@ -107,7 +107,7 @@ class Horizon:
             if frame.covariance is not None and frame.cam_from_world is not None and anchor.covariance is not None:
                 first = anchor.pose[0], unit * anchor.pose[1]
                 pose = frame.cam_from_world.rotation.matrix(), frame.cam_from_world.translation
-                frame.covariance = frame.covariance + carried(_in_unit(anchor.covariance, unit), first, pose)
+                frame.covariance = frame.covariance + carried(covariance_in_unit(anchor.covariance, unit), first, pose)
         result.frames = [
             *(_kept(frame, image.covariance, unit) for frame, image in zip(live, images[: self.begin], strict=False)),
             *result.frames,
@@ -146,10 +146,5 @@ def _kept(frame: FrameResult, covariance: Array | None, unit: float) -> FrameRes
         frame,
         message=f"beyond the horizon; {frame.message}",
         cam_from_world=pycolmap.Rigid3d(pose.rotation, unit * pose.translation),
-        covariance=None if covariance is None else _in_unit(covariance, unit),
+        covariance=None if covariance is None else covariance_in_unit(covariance, unit),
     )
-
-
-def _in_unit(covariance: Array, unit: float) -> Array:
-    units = np.repeat([1.0, unit], 3)
-    return np.asarray(covariance * np.outer(units, units))

@@ -41,6 +41,12 @@ class Similarity:
         return self.rotation @ world_from_cam
 
 
+def covariance_in_unit(covariance: Array, unit: float) -> Array:
+    """A covariance (6, 6) of rotation and translation, in the axes of the camera, with lengths `unit` times as long."""
+    units = np.repeat([1.0, unit], 3)
+    return np.asarray(covariance * np.outer(units, units))
+
+
 def registered_frames(centers: Array) -> NDArray[np.bool_]:
     """(n,) whether each camera centre (n, 3) is known; those of unregistered frames are NaN."""
     return np.asarray(np.isfinite(centers).all(axis=-1))
