@@ -60,13 +60,6 @@ class Page(Report):
         self.click("footage", (place.x + 0.5) / camera.width, (place.y + 0.5) / camera.height)
 
 
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chromium]:
-    browser = Chromium(tmp_path_factory.mktemp("profile"))
-    yield browser
-    browser.close()
-
-
 @pytest.fixture
 def page(browser: Chromium, tmp_path: Path) -> Iterator[Page]:
     result = with_thumbnails(room())

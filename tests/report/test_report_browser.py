@@ -83,13 +83,6 @@ class Report:
         assert self.run("document.documentElement.scrollWidth - innerWidth") <= 0
 
 
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chromium]:
-    browser = Chromium(tmp_path_factory.mktemp("profile"))
-    yield browser
-    browser.close()
-
-
 @pytest.fixture
 def report(browser: Chromium, tmp_path: Path) -> Iterator[Report]:
     report = Report(browser, tmp_path)
