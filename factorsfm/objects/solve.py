@@ -20,6 +20,7 @@ from factorsfm.polish.polish import polish
 from factorsfm.polish.polished import Polished
 from factorsfm.support.errors import ReconstructionError
 from factorsfm.support.options import Options
+from factorsfm.support.similarity import covariance_in_unit
 from factorsfm.support.status import ShotKind
 from factorsfm.tracks.image_tracks import ImageTracks, seen_by
 
@@ -145,12 +146,11 @@ def _result(
     covariance = carried @ covariance @ carried.transpose(0, 2, 1)
     scale = scale_at_rest(_sighting(poses, covariance, seen)) or _scale(polished, images, seen)
     size = scale.value if scale is not None else seen[0].median_depth / float(points[:, 2].mean())
-    unit = np.repeat([1.0, size], 3)
     frames = []
     for pose, uncertain, camera in zip(poses, covariance, seen, strict=True):
         cam_from_object = pycolmap.Rigid3d(pose.rotation, size * pose.translation)
         world_from_object = camera.cam_from_world.inverse() * cam_from_object
-        frames.append(ObjectFrame(camera.index, world_from_object, uncertain * np.outer(unit, unit)))
+        frames.append(ObjectFrame(camera.index, world_from_object, covariance_in_unit(uncertain, size)))
     return ObjectResult(
         name=name,
         frames=tuple(frames),

@@ -13,6 +13,7 @@ from factorsfm.camera.projection import with_focal
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.polish.polished import Polished
 from factorsfm.result.reconstruction import FrameResult, PriorFit
+from factorsfm.support.similarity import covariance_in_unit
 from factorsfm.support.status import FrameStatus, ShotKind
 
 _INLIER_SIGMAS = 8.0  # an observation with a larger reprojection error is no inlier
@@ -79,10 +80,9 @@ def _add_solution(
     state, lens = polished.state, polished.lens
     rotation = pycolmap.Rotation3d(state.rotation[row])
     result.cam_from_world = pycolmap.Rigid3d(rotation, state.translation[row] * unit)
-    size = np.repeat([1.0, unit], 3)
-    result.covariance = polished.covariance[row] * np.outer(size, size)
+    result.covariance = covariance_in_unit(polished.covariance[row], unit)
     if row > 0:
-        result.relative_covariance = polished.relative_covariance[row] * np.outer(size, size)
+        result.relative_covariance = covariance_in_unit(polished.relative_covariance[row], unit)
     result.observability = polished.observability[row]
     if len(state.log_focal) > 1:
         result.camera = with_focal(camera, float(state.focal[row]))
