@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import astuple, dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -38,7 +37,7 @@ class BarDetector:
     def push(self, grey: NDArray[np.uint8]) -> PictureArea | None:
         """The picture of a (h, w) frame and all before it; None if it fills the image."""
         height, width = grey.shape
-        for side, lines in zip(self._sides, _edges(grey), strict=False):
+        for side, lines in zip(self._sides, _edges(grey, [side.reach for side in self._sides]), strict=False):
             side.add(*lines)
         left, right, top, bottom = (side.width for side in self._sides)
         if (left == 0) != (right == 0) and left + right > _ALONE * width:
@@ -71,6 +70,11 @@ class _Side:
     width: int = 0
     entered: bool = False
 
+    @property
+    def reach(self) -> int | None:
+        """How many lines of the next frame to look at, None for all: a bar is hardly wider than it was before."""
+        return None if self.nearest is None else self.nearest + 2 * _EDGE_PX
+
     def add(self, dark: int, is_edge: bool) -> None:
         """Take a frame with so many dark lines; is_edge: whether these end along one line."""
         self.nearest = dark if self.nearest is None else min(self.nearest, dark)
@@ -81,37 +85,40 @@ class _Side:
             self.width = max(self.width, dark)
 
 
-def _edges(grey: NDArray[np.uint8]) -> list[tuple[int, bool]]:
-    """Of left, right, top and bottom: how many lines are dark, and whether they end along one line; [] if all are."""
-    level = min(float(np.median(border)) for border in (grey[0], grey[-1], grey[:, 0], grey[:, -1]))
+def _edges(grey: NDArray[np.uint8], reach: list[int | None]) -> list[tuple[int, bool]]:
+    """Of left, right, top and bottom: how many lines are dark, and whether they end along one line; [] if all are.
+
+    Args:
+        reach: how many lines of each are looked at, None for all.
+    """
+    level = int(min(np.median(border) for border in (grey[0], grey[-1], grey[:, 0], grey[:, -1])))
     if level > _BRIGHTEST_BAR:
         return [(0, False)] * 4
-    above = np.asarray(cv2.subtract(grey, level), np.uint8)
-    if not (above > _LIT).any():
+    height, width = grey.shape
+    columns, rows = grey[:: max(1, height // _COMPARED)].T, grey[:, :: max(1, width // _COMPARED)]
+    lit = rows[:: max(1, height // _COMPARED)] > level + _LIT
+    if not lit.any():
         return []
-    height, width = above.shape
-    columns = above[:: max(1, height // _COMPARED)].T
-    rows = above[:, :: max(1, width // _COMPARED)]
     # With bars on all sides, the ends of a line are those of the picture.
-    across, along = _extent(columns), _extent(rows)
+    across, along = _extent(lit.T), _extent(lit)
     found = []
     for lines, (first, last) in ((columns, along), (rows, across)):
         length = lines.shape[1]
         picture = lines[:, int(first * length) : max(int(first * length) + 1, int(last * length))]
-        found += [_dark_lines(picture), _dark_lines(picture[::-1])]
+        found += [_dark_lines(side[: reach[len(found) + k]], level) for k, side in enumerate((picture, picture[::-1]))]
     return found
 
 
-def _extent(lines: NDArray[np.uint8]) -> tuple[float, float]:
+def _extent(lit: NDArray[np.bool_]) -> tuple[float, float]:
     """First and last line that text alone does not light, as shares of all lines."""
-    share = (lines > _LIT).mean(axis=1)
+    share = lit.mean(axis=1)
     places = np.flatnonzero(share > _PICTURE * share.max())
-    return float(places[0]) / len(lines), float(places[-1] + 1) / len(lines)
+    return float(places[0]) / len(lit), float(places[-1] + 1) / len(lit)
 
 
-def _dark_lines(lines: NDArray[np.uint8]) -> tuple[int, bool]:
+def _dark_lines(lines: NDArray[np.uint8], level: int) -> tuple[int, bool]:
     """How many lines from the first on are dark but for text, and whether the picture begins there along one line."""
-    lit, bright = _shares(lines, _LIT), _shares(lines, _BRIGHT)
+    lit, bright = _shares(lines > level + _LIT), _shares(lines > level + _BRIGHT)
     picture = np.flatnonzero((lit[0] > _TOUCHED) | (lit[1] > _TEXT))
     if not len(picture):
         return len(lines), False
@@ -120,8 +127,8 @@ def _dark_lines(lines: NDArray[np.uint8]) -> tuple[int, bool]:
     return dark, bool(corners > _EDGE_ENDS and whole > _EDGE_LINE)
 
 
-def _shares(lines: NDArray[np.uint8], level: int) -> NDArray[np.float64]:
+def _shares(above: NDArray[np.bool_]) -> NDArray[np.float64]:
     """(2, n) shares of what is above a level, at the ends of n lines and in all of each."""
-    end, above = max(1, round(_CORNERS * lines.shape[1])), lines > level
+    end = max(1, round(_CORNERS * above.shape[1]))
     corners = 0.5 * (above[:, :end].mean(axis=1) + above[:, -end:].mean(axis=1))
     return np.stack([corners, above.mean(axis=1)])

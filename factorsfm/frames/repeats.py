@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,17 +25,17 @@ class RepeatDetector:
     """Recognises repeated frames one by one, without looking ahead."""
 
     def __init__(self) -> None:
-        self._before: NDArray[np.int16] | None = None
+        self._before: NDArray[np.uint8] | None = None
         self._differences: deque[float] = deque(maxlen=_AROUND)  # of new frames
         self._in_a_row = 0
 
     def push(self, grey: NDArray[np.uint8]) -> bool:
         """Whether a frame, (h, w), repeats the one before. Noise of the camera differs between any two new frames."""
-        rows = grey[:: max(1, grey.size // _COMPARED_PIXELS)].astype(np.int16)
+        rows = np.ascontiguousarray(grey[:: max(1, grey.size // _COMPARED_PIXELS)])
         before, self._before = self._before, rows
         if before is None:
             return False
-        difference = float(np.abs(rows - before).mean())
+        difference = _mean_difference(rows, before)
         if self._is_repeat(difference, rows):
             self._in_a_row += 1
             if self._in_a_row <= _MOST_IN_A_ROW:
@@ -44,7 +45,11 @@ class RepeatDetector:
         self._differences.append(difference)
         return False
 
-    def _is_repeat(self, difference: float, rows: NDArray[np.int16]) -> bool:
+    def _is_repeat(self, difference: float, rows: NDArray[np.uint8]) -> bool:
         if len(self._differences) < _LEAST_AROUND or difference >= _REPEATED * float(np.median(self._differences)):
             return False
-        return difference < _MOVED_PX * float(np.abs(np.diff(rows, axis=1)).mean())
+        return difference < _MOVED_PX * _mean_difference(rows[:, 1:], rows[:, :-1])
+
+
+def _mean_difference(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> float:
+    return cv2.mean(cv2.absdiff(a, b))[0]
