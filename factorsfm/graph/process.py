@@ -31,13 +31,15 @@ from factorsfm.support.errors import FactorsfmError
 Subject = TypeVar("Subject")
 Result = TypeVar("Result")
 
-# The same package and libraries as here, but nothing that only `factorsfm/__init__.py` imports: half of the start.
+# The same package and libraries as here, but nothing that is imported for the user's sake only: half of the start.
 _MAIN = """
-import sys, types
-package = types.ModuleType("factorsfm")
-package.__path__ = [sys.argv[1]]
-sys.modules["factorsfm"], sys.path = package, sys.argv[2:]
+import importlib, sys, types
+folder, module, *sys.path = sys.argv[1:]
+for name in ("factorsfm", "factorsfm.priors"):
+    sys.modules[name] = types.ModuleType(name)
+    sys.modules[name].__path__ = [folder + name.removeprefix("factorsfm").replace(".", "/")]
 from factorsfm.graph.server import serve
+importlib.import_module(module)
 serve()
 """
 _SECONDS_TO_END = 5.0  # for a process whose output has ended
@@ -47,12 +49,16 @@ _SECONDS_TO_ANSWER = 60.0
 
 
 class GraphProcess(Closing):
-    """Updates of one graph, made one after the other beside everything else."""
+    """Updates of one graph, made one after the other beside everything else.
 
-    def __init__(self) -> None:
+    Args:
+        module: of the updates, which the process imports before it is asked for one.
+    """
+
+    def __init__(self, module: str = KeyframeGraph.__module__) -> None:
         self._worker = ThreadPoolExecutor(1, "factorsfm-graph")
-        self._anew = True
-        self._process: _Process | None = _Process()
+        self._anew, self._module = True, module
+        self._process: _Process | None = _Process(module)
 
     def submit(self, work: Callable[[], Result]) -> Future[Result]:
         """Do some work in a thread beside everything else, after all that was submitted before; it may `ask`."""
@@ -70,7 +76,7 @@ class GraphProcess(Closing):
             FactorsfmError: the process ended by itself, which another one would do, too.
         """
         request, self._anew = Request(update, subject, self._anew), False
-        process, self._process = self._process or _Process(), None
+        process, self._process = self._process or _Process(self._module), None
         try:
             answer = process.ask(request)
         except BaseException:  # Ctrl-C, too: this answer must not be taken for that of the next request
@@ -101,10 +107,10 @@ class GraphProcessKilledError(FactorsfmError):
 class _Process:
     """The other side; it ends with this one, however this one ends."""
 
-    def __init__(self) -> None:
+    def __init__(self, module: str) -> None:
         package = Path(__file__).parents[1]
         path = [entry or os.getcwd() for entry in sys.path]
-        command = [spawn.get_executable(), "-c", _MAIN, str(package), *path]
+        command = [spawn.get_executable(), "-c", _MAIN, str(package), module, *path]
         # A group of its own, so that Ctrl-C in a terminal does not reach it even before it can ignore signals.
         self._popen = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, process_group=0)
         self._end = weakref.finalize(self, _end, self._popen)

@@ -14,6 +14,8 @@ from factorsfm.priors.image_depth import ImageDepth
 
 logger = logging.getLogger(__name__)
 
+UPDATES = update_map.__module__  # for `GraphProcess`
+
 
 def submit_update(
     graph: GraphProcess, copy: MapCopy, read_depth: Callable[[], ImageDepth | None] | None

@@ -43,7 +43,7 @@ Index = NDArray[np.int64]
 logger = logging.getLogger(__name__)
 
 _STATE = ("focal", "first_focal", "keyframes", "new_points", "parallax", "started", "unit", "_due")
-_RUNNING_OUT = 0.5  # share of an image's tracks with a point, below which the map is extended at once
+_RUNNING_OUT = 0.45  # share of an image's tracks with a point, below which the map is extended at once
 _SETTLED, _SETTLED_DELAY = 5, 2  # keyframes of a map that changes little; frames that it waits longer for the graph
 
 

@@ -19,6 +19,7 @@ from factorsfm.graph.contents import Factors, LiveGraph, Values, empty_graph
 from factorsfm.graph.process import GraphProcess
 from factorsfm.inertial.recording import ImuRecording
 from factorsfm.lens.camera_model import distortion_of
+from factorsfm.mapping.graph_updates import UPDATES
 from factorsfm.mapping.mapper import Mapper
 from factorsfm.mending.user_tracks import UserTracks
 from factorsfm.priors.depth import DepthPrior
@@ -105,7 +106,7 @@ class Stream(Closing):
         self._finder = ViewFinder(self._tracker)
         self._horizon = Horizon(horizon if control is None and imu is None else None)
         self._thumbnails = self._held.enter_context(Thumbnails())
-        self._graph = self._held.enter_context(GraphProcess())  # it starts while the source opens
+        self._graph = self._held.enter_context(GraphProcess(UPDATES))  # it starts while the source opens
         self._mapper: Mapper | None = None
         self._size = (0, 0)
         self._colors = TrackColors()
