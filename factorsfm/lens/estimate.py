@@ -34,9 +34,10 @@ _TURNING_STD = 1.0
 _CONTRADICTION = 3.0  # standard deviations between what the shot and what EXIF data say
 _MISFIT = 1.5  # of the standard deviation above which a solution is doubted
 # Distortion is believed where neither random errors explain it nor those of tracks that move together: an actor without
-# a mask looks like a displacement of 1 to 4 thousandths of the width at the outermost tracks.
+# a mask looks like a displacement of 1 to 4 thousandths of the width at the outermost tracks, and what compression does
+# to whole blocks like one of several times the noise of a track.
 _LEAST_EVIDENCE = 9.0  # squared standard deviations
-_JOINT_DISPLACEMENT = 0.00125  # of the width: standard deviation
+_JOINT_DISPLACEMENT, _JOINT_NOISE = 0.00125, 3.0  # standard deviations: of the width, and times the noise
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,10 +168,11 @@ def _judged_shape(straight: _Solution, free: tuple[BundleAdjustment, bool], gues
     std, left_out, evidence = lens_deviations(full, guess.shape)
     displacement = _displacement(full, guess.shape)
     logger.info(
-        "distortion %s, %.0f squared deviations, displaces by %.1f pixels; focal length within %.2f %%",
-        np.round(full.state.lens, 4), evidence, displacement, 100 * _largest(std, left_out, groups),
+        "distortion %s, %.0f squared deviations, displaces by %.1f pixels, noise %.2f; focal length within %.2f %%",
+        np.round(full.state.lens, 4), evidence, displacement, full.sigma, 100 * _largest(std, left_out, groups),
     )  # fmt: skip
-    joint = _JOINT_DISPLACEMENT * width * float(np.median(guess.focal)) / max(displacement, 1e-9)
+    joint = np.hypot(_JOINT_DISPLACEMENT * width * float(np.median(guess.focal)), _JOINT_NOISE * full.sigma)
+    joint /= max(displacement, 1e-9)
     believed = evidence > _LEAST_EVIDENCE * (1.0 + evidence * joint**2)  # both variances add up
     if believed and std[:groups].max() < DETERMINED_FOCAL_STD:
         return _Solution(full, moves, std, left_out, _largest(std, left_out, groups) < DETERMINED_FOCAL_STD)
