@@ -114,7 +114,7 @@ def estimate_lens(
         starts.append((straight.adjustment.state, straight.adjustment.sigma, straight.moves))
         free = _with_free_shape(solver, starts, sigmas)
         if free is not None:
-            best = _judged_shape(straight, free, guess, width)
+            best = _judged_shape(straight, free, guess)
     estimate = _concluded(best, guess, first_focal or (guess.focal, 0.0), options, held=held)
     return _settled(adjustment, best, estimate, start, options), estimate
 
@@ -157,11 +157,11 @@ def _with_free_shape(
     return None
 
 
-def _judged_shape(straight: _Solution, free: tuple[BundleAdjustment, bool], guess: Lens, width: float) -> _Solution:
+def _judged_shape(straight: _Solution, free: tuple[BundleAdjustment, bool], guess: Lens) -> _Solution:
     """The solution with a free shape where it is believed, else the one without, as uncertain as the other makes it.
 
     Args:
-        free: with a free shape, and whether its camera moves; width: of what the tracks fill, normalised.
+        free: with a free shape, and whether its camera moves.
     """
     groups = straight.groups
     full, moves = free
@@ -171,7 +171,8 @@ def _judged_shape(straight: _Solution, free: tuple[BundleAdjustment, bool], gues
         "distortion %s, %.0f squared deviations, displaces by %.1f pixels, noise %.2f; focal length within %.2f %%",
         np.round(full.state.lens, 4), evidence, displacement, full.sigma, 100 * _largest(std, left_out, groups),
     )  # fmt: skip
-    joint = np.hypot(_JOINT_DISPLACEMENT * width * float(np.median(guess.focal)), _JOINT_NOISE * full.sigma)
+    width = observed_width(full.state, full.observations) * float(np.median(full.state.focal))
+    joint = np.hypot(_JOINT_DISPLACEMENT * width, _JOINT_NOISE * full.sigma)
     joint /= max(displacement, 1e-9)
     believed = evidence > _LEAST_EVIDENCE * (1.0 + evidence * joint**2)  # both variances add up
     if believed and std[:groups].max() < DETERMINED_FOCAL_STD:

@@ -18,7 +18,7 @@ Index = NDArray[np.int64]
 # The time of a solution grows with the square of their number, and there are many: from several starts, through several
 # lenses, with and without translation. More frames hardly make lens and motion more certain, since the errors of tracks
 # persist from one to the next.
-_FRAMES = 100
+_FRAMES = 60
 _IN_COMMON = 0.25  # of the tracks of a frame, which the one before it sees, too: a hundred and more
 
 
