@@ -26,6 +26,7 @@ logger = logging.getLogger(__name__)
 _LARGEST_ERROR_PX = 10.0  # median, of the newest keyframe
 _LEAST_IN_FRONT = 0.7  # of the landmarks of the newest keyframe
 _FIRM_LANDMARK_SIGMA = 0.3  # see `LANDMARK_SIGMA`, where an update fails
+_MORE_KEYFRAMES = 1.15  # times as many as left the focal length open, before it is tried again: a try takes many steps
 _LARGEST_LENS_STEP = 0.5  # of the logarithm of the focal length
 _MIRRORED = "the depth is mirrored: the scale of a prior is negative"
 
@@ -60,6 +61,7 @@ class KeyframeGraph:
 
     def __init__(self) -> None:
         self._live = LiveIsam()
+        self._opens_lens_from = 0  # keyframes
 
     def update(
         self,
@@ -85,7 +87,7 @@ class KeyframeGraph:
                 solved = live.update(window, iterations, added, held)
                 reason = _fault(solved, window.focal)
                 if not reason:
-                    self._live, solved = _with_open_lens(live, solved)
+                    self._live, solved = self._with_open_lens(live, solved)
                     covariance = self._live.covariances(solved)
                     if not added.numbers:
                         return UpdateResult(True, "committed", solved, covariance)
@@ -97,22 +99,22 @@ class KeyframeGraph:
                 reason = f"the linear system of the update is indeterminate ({_first_line(error)})"
         return _rolled_back(window, reason)
 
+    def _with_open_lens(self, live: LiveIsam, window: Window) -> tuple[LiveIsam, Window]:
+        """The graph with the focal length among its variables, from when on the map determines it."""
+        if not window.open_lens or live.free_lens or len(window.keyframes) < self._opens_lens_from:
+            return live, window
+        try:
+            found = live.with_free_lens(window)
+            if found is not None and not _fault(found[1], window.focal):
+                return found
+        except Exception as error:
+            logger.debug("the focal length stays as it is: %s", _first_line(error))
+        self._opens_lens_from = int(np.ceil(_MORE_KEYFRAMES * len(window.keyframes)))
+        return live, window
+
     def contents(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
         """A copy of the factors, and the estimate."""
         return self._live.contents()
-
-
-def _with_open_lens(live: LiveIsam, window: Window) -> tuple[LiveIsam, Window]:
-    """The graph with the focal length among its variables, from when on the map determines it."""
-    if not window.open_lens or live.free_lens:
-        return live, window
-    try:
-        found = live.with_free_lens(window)
-        if found is not None and not _fault(found[1], window.focal):
-            return found
-    except Exception as error:
-        logger.debug("the focal length stays as it is: %s", _first_line(error))
-    return live, window
 
 
 def _first_line(error: Exception) -> str:

@@ -48,6 +48,7 @@ LANDMARK_SIGMA = 3.0  # of the weak prior of a landmark, in units of its distanc
 _DEPTHS = 100  # depth factors of a keyframe, beside one for each landmark that has none yet: errors of a network repeat
 _FREE_LENS = 0.3  # relative standard deviation of a focal length that is estimated
 _LENS_STD = 0.0022  # relative, of independent observations, with which a focal length counts as determined
+_NEARLY = 1.2  # times that, beyond which further steps do not lead there
 _LENS_STEPS, _LENS_TOLERANCE = 6, 1e-4
 _LENS_STEP = 0.03  # of the logarithm of the focal length, that can be made in one go
 _LANDMARK = ord("l")  # character of the symbols L
@@ -138,6 +139,8 @@ class LiveIsam:
             for focal in np.geomspace(before, after, steps + 2)[1:].tolist():
                 live._set_lens_prior(focal, HELD)
             live._free_lens()
+            if live.focal_std() > _NEARLY * _LENS_STD:
+                return None
         for _ in range(_LENS_STEPS):
             before = live._estimated_focal()
             live._free_lens()

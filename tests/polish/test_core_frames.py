@@ -24,9 +24,9 @@ def tracks_of(length, frames):
     return Observations(frame[inside], point[inside], np.zeros((int(inside.sum()), 2)))
 
 
-@pytest.mark.parametrize(("length", "expected"), [(100, 100), (6, 200), (3, 400)])
+@pytest.mark.parametrize(("length", "expected"), [(100, 60), (6, 120), (3, 240), (1, 400)])
 def test_frames_are_few_as_long_as_they_see_the_same(length, expected):
-    """Of 400 frames: every fourth and more needs tracks of six, which then have a third in common."""
+    """Of 400 frames: every third and fourth needs tracks of six, which then have a third in common."""
     rows = core_frames(tracks_of(length, 400), 400)
     assert len(rows) == expected
     assert rows[0] == 0
@@ -41,11 +41,11 @@ def test_a_view_that_is_lost_asks_for_no_more_frames():
         np.r_[before.point, after.point + before.point.max() + 1],
         np.concatenate([before.pixels, after.pixels]),
     )
-    assert len(core_frames(both, 400)) == 100
+    assert len(core_frames(both, 400)) == 60
 
 
 def test_a_short_shot_is_solved_on_all_frames():
-    np.testing.assert_array_equal(core_frames(tracks_of(3, 80), 80), np.arange(80))
+    np.testing.assert_array_equal(core_frames(tracks_of(3, 48), 48), np.arange(48))
 
 
 def polished(motion, lens, monkeypatch, few):
