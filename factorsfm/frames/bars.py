@@ -101,7 +101,7 @@ def _edges(grey: NDArray[np.uint8], reach: list[int | None]) -> list[tuple[int, 
         return []
     # With bars on all sides, the ends of a line are those of the picture.
     across, along = _extent(lit.T), _extent(lit)
-    found = []
+    found: list[tuple[int, bool]] = []
     for lines, (first, last) in ((columns, along), (rows, across)):
         length = lines.shape[1]
         picture = lines[:, int(first * length) : max(int(first * length) + 1, int(last * length))]

@@ -18,7 +18,9 @@ from numpy.typing import NDArray
 
 from factorsfm.frames.block_matching import Thumbnail, dissimilarity, dissolve_variances
 from factorsfm.frames.frame import Frame
+from factorsfm.frames.timing import Pace
 from factorsfm.support.errors import InputError
+from factorsfm.support.pace import frames_in
 
 T = TypeVar("T")
 
@@ -28,25 +30,25 @@ _BLANK_SHARE = 0.1  # share of the blocks with texture, below which a frame is b
 _CUT_DISSIMILARITY = 0.12
 _CUT_TIMES_MEDIAN = 3.0  # the same as a multiple of the median of the last frames, if their motion is large
 _HISTORY_FRAMES = 12  # of that median
-_DOUBLING_FRAMES = 12  # gap after which the threshold is twice as large, because the camera moves on meanwhile
+_DOUBLING_SECONDS = 0.5  # gap after which the threshold is twice as large, because the camera moves on meanwhile
 
 # Fades: frames of low contrast are not compared.
 _FULL_CONTRAST = 8.0  # grey levels: enough for a frame to be compared with
 _FULL_CONTRAST_SHARE = 0.5  # of the highest contrast of the last frames: also enough
 _FADED_CONTRAST = 4.0  # grey levels, below which a frame is faded if the frames before had more contrast
-_FADE_FRAMES = 12  # longest fade; after it, a frame of low contrast is compared
+_FADE_SECONDS = 0.5  # longest fade; after it, a frame of low contrast is compared
 
-_INTERRUPTION_FRAMES = 4  # if the view is back after no more frames than these, they were a flash or damaged
+_INTERRUPTION_SECONDS = 1.0 / 6.0  # if the view is back after no more than that, it was a flash or damage
 
 # Dissolves.
-_SPANS = (4, 8)  # frames from the middle of a dissolve to the two frames that blend in it
+_SPANS = (1.0 / 6.0, 1.0 / 3.0)  # seconds from the middle of a dissolve to the two frames that blend in it
 _ENDS_DISSIMILARITY = 0.2  # least dissimilarity of these two
 _MOST_ALONE = 0.9  # largest share of variance that one of them explains alone
 _LEAST_TOGETHER = 0.85  # smallest share that both explain together
 _REST_RATIO = 0.3  # largest ratio of what both leave unexplained to what one alone leaves
 _CONFIRMATIONS = 2  # frames in a row that must show a dissolve
-_SETTLED_DISSIMILARITY = 0.03  # to the frame four before, below which the dissolve is over
-_DISSOLVE_FRAMES = 12  # after which it is over in any case
+_SETTLED_DISSIMILARITY = 0.03  # to the frame the shorter span before, below which the dissolve is over
+_DISSOLVE_SECONDS = 0.5  # after which it is over in any case
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +79,7 @@ class _Shot:
     number: int
     end: int
     history: deque[float] = field(default_factory=lambda: deque(maxlen=_HISTORY_FRAMES))
-    recent: deque[Thumbnail] = field(default_factory=lambda: deque(maxlen=2 * max(_SPANS) + 1))  # without a gap
+    recent: deque[Thumbnail] = field(default_factory=deque)  # without a gap
     blended: int = 0  # frames in a row that show a dissolve
     dissolving: int = 0  # frames since a dissolve was confirmed
 
@@ -88,17 +90,25 @@ class _Shot:
         place = max(k for k, contrast in enumerate(contrasts) if contrast >= enough)
         return self.recent[place], len(contrasts) - 1 - place
 
-    def threshold(self, gap: int) -> float:
+    def add(self, thumbnail: Thumbnail, rate: float) -> None:
+        """Remember the newest frame, and no more of them than a dissolve needs; `rate`: frames a second."""
+        self.recent.append(thumbnail)
+        while len(self.recent) > 2 * frames_in(max(_SPANS), rate) + 1:
+            self.recent.popleft()
+
+    def threshold(self, gap: int, rate: float) -> float:
         """Largest dissimilarity of a frame of the same shot, `gap` frames after the one it is compared with."""
         usual = _CUT_TIMES_MEDIAN * statistics.median(self.history) if self.history else 0.0
-        return max(_CUT_DISSIMILARITY, usual) * (1.0 + min(gap / _DOUBLING_FRAMES, 1.0))
+        return max(_CUT_DISSIMILARITY, usual) * (1.0 + min(gap / frames_in(_DOUBLING_SECONDS, rate), 1.0))
 
-    def is_dissolving(self) -> bool:
+    def is_dissolving(self, rate: float) -> bool:
         """Whether a dissolve is confirmed by the newest frames, or was confirmed and is not over."""
+        spans = [frames_in(span, rate) for span in _SPANS]
         if self.dissolving:
-            before, newest = self.recent[-1 - min(_SPANS)], self.recent[-1]
-            return self.dissolving < _DISSOLVE_FRAMES and dissimilarity(before, newest) > _SETTLED_DISSIMILARITY
-        self.blended = self.blended + 1 if any(map(self._is_blend, _SPANS)) else 0
+            before, newest = self.recent[max(-1 - spans[0], -len(self.recent))], self.recent[-1]
+            settled = dissimilarity(before, newest) <= _SETTLED_DISSIMILARITY
+            return self.dissolving < frames_in(_DISSOLVE_SECONDS, rate) and not settled
+        self.blended = self.blended + 1 if any(map(self._is_blend, spans)) else 0
         return self.blended >= _CONFIRMATIONS
 
     def _is_blend(self, span: int) -> bool:
@@ -119,7 +129,7 @@ class CutDetector:
     at the first frame that shows something; and dissolves of about six frames to a second, where the shot ends in the
     middle and the next begins when the view no longer changes.
 
-    A black or blown-out stretch with the same view before and after it is no cut, nor are up to four frames of
+    A black or blown-out stretch with the same view before and after it is no cut, nor is a sixth of a second of
     something else.
 
     It misses dissolves while the camera moves fast, wipes, and cuts to almost the same view. It takes a jump of more
@@ -134,8 +144,7 @@ class CutDetector:
     """
 
     def __init__(self) -> None:
-        self._pushed = 0
-        self._shots = 0
+        self._pushed, self._shots, self._pace = 0, 0, Pace()
         self._size: tuple[int, ...] = ()
         self._shot: _Shot | None = None
         self._interrupted: _Shot | None = None  # the shot before, while its view may come back
@@ -154,6 +163,8 @@ class CutDetector:
         if self._size not in ((), size):
             raise InputError(f"frame {self._pushed} has shape {size}, expected {self._size} as the frames before")
         self._size = size
+        if isinstance(frame, Frame):
+            self._pace.push(frame.index, frame.timestamp)
         index, self._pushed = self._pushed, self._pushed + 1
         thumbnail = Thumbnail.of(image)
         textured, blocks = int(thumbnail.textured.sum()), len(thumbnail.textured)
@@ -166,10 +177,14 @@ class CutDetector:
             return self._begin(index, thumbnail, float("nan"), "first frame that shows something")
         return self._compare(index, thumbnail, self._shot)
 
+    def _frames(self, seconds: float) -> int:
+        """How many frames come in a time."""
+        return frames_in(seconds, self._pace.rate)
+
     def _has_faded(self, index: int, thumbnail: Thumbnail) -> bool:
         """Whether the contrast is too low, beside that of the shot, to compare the views."""
         shot = self._shot
-        if shot is None or thumbnail.contrast >= _FADED_CONTRAST or index - shot.end > _FADE_FRAMES:
+        if shot is None or thumbnail.contrast >= _FADED_CONTRAST or index - shot.end > self._frames(_FADE_SECONDS):
             return False
         return thumbnail.contrast < _FULL_CONTRAST_SHARE * shot.reference()[0].contrast
 
@@ -178,7 +193,7 @@ class CutDetector:
             return returned
         gap = index - shot.end - 1
         reference, age = shot.reference()
-        difference, threshold = dissimilarity(reference, thumbnail), shot.threshold(gap + age)
+        difference, threshold = dissimilarity(reference, thumbnail), shot.threshold(gap + age, self._pace.rate)
         if difference < threshold:
             return self._go_on(index, thumbnail, shot, difference, gap)
         self._interrupted = self._interrupted or shot
@@ -193,14 +208,14 @@ class CutDetector:
             return None
         gap = index - before.end - 1
         reference, age = before.reference()
-        if gap > _INTERRUPTION_FRAMES:
+        if gap > self._frames(_INTERRUPTION_SECONDS):
             self._interrupted = None
             return None
         difference = dissimilarity(reference, thumbnail)
-        if difference < before.threshold(gap + age):
+        if difference < before.threshold(gap + age, self._pace.rate):
             before.end = index
             before.recent.clear()
-            before.recent.append(thumbnail)
+            before.add(thumbnail, self._pace.rate)
             self._shot, self._interrupted = before, None
             return ShotUpdate(index, before.number, False, difference, f"the view is back after {gap} other frames")
         return None
@@ -211,10 +226,10 @@ class CutDetector:
         shot.end = index
         if gap:
             shot.recent.clear()
-        shot.recent.append(thumbnail)
+        shot.add(thumbnail, self._pace.rate)
         if gap:
             return ShotUpdate(index, shot.number, False, difference, f"the view is back after {gap} blank frames")
-        if shot.is_dissolving():
+        if shot.is_dissolving(self._pace.rate):
             shot.dissolving += 1
             return ShotUpdate(index, None, False, difference, "dissolve: the last frames blend two views")
         if shot.dissolving:
@@ -225,7 +240,7 @@ class CutDetector:
 
     def _begin(self, index: int, thumbnail: Thumbnail, difference: float, reason: str) -> ShotUpdate:
         self._shot = _Shot(self._shots, index)
-        self._shot.recent.append(thumbnail)
+        self._shot.add(thumbnail, self._pace.rate)
         self._shots += 1
         return ShotUpdate(index, self._shot.number, True, difference, reason)
 

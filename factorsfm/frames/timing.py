@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.support.pace import USUAL_RATE
+
 # Of the usual interval. Containers round times to a millisecond at worst, which is a tenth at 100 frames a second; a
 # frame that was left out makes 1.
 _UNEVEN = 0.2
+
+_PACED = 25  # frames, the last of which tell the rate of a source
+# Frames a second: slower sources are photographs one after another, of which as many are needed as of a video.
+_SLOWEST, _FASTEST = 12.0, 240.0
 
 _LONGEST_PERIOD = 12  # frames: telecine has 5, animation 4 at most
 # What a cadence has to explain of the repeats, or all but one: the first repeat of a shot is missed.
@@ -27,6 +34,29 @@ def frame_interval(indices: Sequence[int], timestamps: Sequence[float | None]) -
         return 0.0
     gaps = np.diff(indices)
     return max(float(np.median(np.diff(times) / gaps)), 0.0) if (gaps > 0).all() else 0.0
+
+
+class Pace:
+    """The rate at which the frames of a source come, as far as their timestamps tell.
+
+    Args:
+        seen: what `state` gave.
+    """
+
+    def __init__(self, seen: Iterable[tuple[int, float | None]] = ()) -> None:
+        self._seen = deque(((index, time) for index, time in seen), _PACED)
+        self.rate = USUAL_RATE  # frames a second
+
+    def push(self, index: int, timestamp: float | None) -> float:
+        """The rate with the next frame, frames a second."""
+        self._seen.append((index, timestamp))
+        interval = frame_interval(*zip(*self._seen, strict=True))
+        self.rate = min(max(1.0 / interval, _SLOWEST), _FASTEST) if interval > 0.0 else USUAL_RATE
+        return self.rate
+
+    def state(self) -> list[tuple[int, float | None]]:
+        """Plain data, of which another one is made."""
+        return list(self._seen)
 
 
 def frame_times(indices: Sequence[int], timestamps: Sequence[float | None]) -> NDArray[np.float64]:

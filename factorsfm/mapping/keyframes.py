@@ -9,23 +9,26 @@ from numpy.typing import NDArray
 
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.support.options import MapperOptions
+from factorsfm.support.pace import frames_in
 from factorsfm.support.rotations import nearest_rotation
 from factorsfm.tracks.image_tracks import ImageTracks, median_flow, shared_tracks
 
 Array = NDArray[np.float64]
 
 _LEAST_SHARED = 0.7  # of the tracks of the last keyframe; with fewer, a new one is made
+_SETTLED, _SETTLED_DELAY = 5, 1.0 / 12.0  # keyframes of a map that changes little; how much longer it waits, seconds
 _ROUGH, _CONTRADICTED, _LATELY = 1.5, 0.8, 5  # ratios of the spread of the errors, and of the share of tracks that
 # agree, to those of the best of so many images before
 
 
 def is_keyframe(
-    image: ImageTracks, last: ImageTracks, count: int, focal: float, width: int, options: MapperOptions, *, rough: bool
-) -> bool:
+    image: ImageTracks, last: ImageTracks, count: int, focal: float, width: int, options: MapperOptions,
+    *, rate: float, rough: bool,
+) -> bool:  # fmt: skip
     """Whether an image shows enough beyond the last keyframe.
 
     Args:
-        count: of the keyframes so far; focal, width: of the images, pixels.
+        count: of the keyframes so far; focal, width: of the images, pixels; rate: frames a second.
         rough: whether the image fits suddenly worse, see `suddenly_rough`: then only where tracks run out.
     """
     if shared_tracks(image, last) < _LEAST_SHARED * len(last.ids):
@@ -35,11 +38,17 @@ def is_keyframe(
     # A young map has the shape that the prior guessed: the first keyframes come soon. Of a camera that hardly moves,
     # ever fewer are needed.
     youth = min(1.0, 0.25 * count)
-    interval = min(2 * count, options.keyframe_interval) * max(1, count // 10)
+    interval = min(2 * count, frames_in(options.keyframe_seconds, rate)) * max(1, count // 10)
     return bool(
         median_flow(image, last) * focal > youth * options.keyframe_flow * width
         or image.position - last.position >= interval
     )
+
+
+def update_delay(count: int, options: MapperOptions, rate: float) -> int:
+    """How many frames after a keyframe the map takes over its update; arguments as in `is_keyframe`."""
+    settled = _SETTLED_DELAY if count >= _SETTLED else 0.0
+    return frames_in(options.graph_delay_seconds + settled, rate)
 
 
 def suddenly_rough(image: MappedImage, images: Sequence[MappedImage], count: int) -> bool:

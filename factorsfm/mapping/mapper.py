@@ -18,7 +18,7 @@ from factorsfm.graph.unit_of_length import unit_of_length
 from factorsfm.mapping.additions import Additions
 from factorsfm.mapping.graph_updates import submit_update
 from factorsfm.mapping.incremental import IncrementalMapper
-from factorsfm.mapping.keyframes import carry, is_keyframe, suddenly_rough
+from factorsfm.mapping.keyframes import carry, is_keyframe, suddenly_rough, update_delay
 from factorsfm.mapping.landmarks import map_tracks
 from factorsfm.mapping.live_covariance import live_covariance
 from factorsfm.mapping.map_contents import MapContents
@@ -33,6 +33,7 @@ from factorsfm.mapping.starts import NoStart, Start
 from factorsfm.mapping.young_map import YOUNG_KEYFRAMES
 from factorsfm.priors.image_depth import ImageDepth
 from factorsfm.support.options import Options
+from factorsfm.support.pace import USUAL_RATE
 from factorsfm.support.parallax import parallax
 from factorsfm.support.status import FrameStatus
 from factorsfm.tracks.image_tracks import ImageTracks
@@ -44,7 +45,6 @@ logger = logging.getLogger(__name__)
 
 _STATE = ("focal", "first_focal", "keyframes", "new_points", "parallax", "started", "unit", "_due")
 _RUNNING_OUT = 0.45  # share of an image's tracks with a point, below which the map is extended at once
-_SETTLED, _SETTLED_DELAY = 5, 2  # keyframes of a map that changes little; frames that it waits longer for the graph
 
 
 class Mapper(IncrementalMapper):
@@ -53,13 +53,13 @@ class Mapper(IncrementalMapper):
     Args:
         graph: that of the keyframes, closed with the mapper.
         focal: pixels; width: of the image, pixels.
-        options: steps, thresholds and weights.
-        has_prior: whether a depth prior exists at all; without one the start is the essential matrix.
+        options: steps, thresholds and weights; has_prior: whether a depth prior exists at all; without one the start is
+            the essential matrix.
     """
 
     def __init__(self, graph: GraphProcess, focal: float, width: int, options: Options, *, has_prior: bool) -> None:
         super().__init__([], focal, options)
-        self.width, self.started = width, False
+        self.width, self.started, self.frame_rate = width, False, USUAL_RATE
         self.keyframes: list[int] = []
         self.burn_ins = np.zeros(0, np.int64)  # tracks that the last image showed to be laid over the image
         self.new_points = 0  # that came with the last image
@@ -324,10 +324,12 @@ class Mapper(IncrementalMapper):
 
     def _is_keyframe(self, image: MappedImage) -> bool:
         last, count = self.images[self.keyframes[-1]].tracks, len(self.keyframes)
-        return is_keyframe(image.tracks, last, count, self.focal, self.width, self.options, rough=image.rough)
+        return is_keyframe(
+            image.tracks, last, count, self.focal, self.width, self.options, rate=self.frame_rate, rough=image.rough
+        )
 
     def _add_keyframe(self, image: MappedImage, read_depth: Callable[[], ImageDepth | None] | None) -> None:
-        """Let the graph work on the keyframe; the map takes over its result after `graph_delay` frames."""
+        """Let the graph work on the keyframe; the map takes over its result after a while."""
         keyframes = [replace(self.images[k]) for k in self.keyframes] + [replace(image)]
         copy = MapCopy(
             keyframes, self.points.copy(), self.options, self.focal, self._refine_focal,
@@ -338,8 +340,7 @@ class Mapper(IncrementalMapper):
         read = read_depth if self._prior.active else None
         self._update = submit_update(self._graph, copy, read)
         image.keyframe = True
-        settled = _SETTLED_DELAY if len(self.keyframes) >= _SETTLED else 0
-        self._due = len(self.images) - 1 + self.options.graph_delay + settled
+        self._due = len(self.images) - 1 + update_delay(len(self.keyframes), self.options, self.frame_rate)
 
     def _take_over(self) -> None:
         """Wait for the graph, and take over the map as it sees it now."""

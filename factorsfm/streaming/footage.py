@@ -16,6 +16,7 @@ from factorsfm.frames.bars import BarDetector
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.recorded import RecordedFootage, Repeat
 from factorsfm.frames.repeats import RepeatDetector
+from factorsfm.frames.timing import Pace
 from factorsfm.streaming.frame_update import FrameUpdate, repeated_update
 from factorsfm.support.picture_area import PictureArea
 
@@ -25,10 +26,12 @@ class Footage:
 
     Attributes:
         repeats: the frames that repeat others, in order.
+        pace: how fast the frames come.
     """
 
     def __init__(self) -> None:
         self.repeats: list[Repeat] = []
+        self.pace = Pace()
         self._pixel_aspect, self._is_field = 1.0, False
         self._detector = RepeatDetector()
         self._bars = BarDetector()
@@ -52,6 +55,7 @@ class Footage:
     def seen(self, frame: Frame) -> tuple[Frame, NDArray[np.uint8]]:
         """The next frame with what of it is picture, and its grey image, (h, w)."""
         grey = _grey(frame)
+        self.pace.push(frame.index, frame.timestamp)
         self._picture, self._shape = self._bars.push(grey), grey.shape
         return replace(frame, picture=self._picture), grey
 
@@ -89,6 +93,7 @@ class Footage:
             "repeats": [astuple(repeat) for repeat in self.repeats],
             "pixels": (self._pixel_aspect, self._is_field),
             "bars": self._bars.state(),
+            "pace": self.pace.state(),
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -96,6 +101,7 @@ class Footage:
         self.repeats = [Repeat(*repeat) for repeat in state["repeats"]]
         self._pixel_aspect, self._is_field = state["pixels"]
         self._bars.restore(state["bars"])
+        self.pace = Pace(state["pace"])
 
 
 def _grey(frame: Frame) -> NDArray[np.uint8]:

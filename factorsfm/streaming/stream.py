@@ -132,6 +132,7 @@ class Stream(Closing):
         focal_changed = self._follow_focal(mapper)
         check_size(frame, self._size)
         frame, grey = self._footage.seen(frame)
+        mapper.frame_rate = self._tracker.frame_rate = self._footage.pace.rate
         with self.seconds.of("masks"):
             mask = self._footage.ignored(read_mask(self._suspicion.sure, frame), self.options.tracker.border_px)
         if (repeated := self._footage.repeated(frame, grey, len(self.frames))) is not None:

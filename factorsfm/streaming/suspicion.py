@@ -23,13 +23,14 @@ from factorsfm.mapping.young_map import YOUNG_KEYFRAMES
 from factorsfm.priors.masks import MaskPrior
 from factorsfm.priors.read_priors import read_mask
 from factorsfm.support.context import Closing
+from factorsfm.support.pace import frames_in
 from factorsfm.tracks.image_tracks import ImageTracks
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Index = NDArray[np.int64]
 
-_INTERVAL = 6  # frames from look to look: nobody appears in a quarter of a second, and a look takes the time of several
+_SECONDS = 0.25  # from look to look: nobody appears in that time, and a look takes the time of several frames
 _SHARE = 0.25  # of the looks at a track must find it in the mask: networks miss half of a person in half of the frames
 _KEYFRAMES = 8  # the newest, in which suspects are compared with the map
 _LOOKS, _IN_MASK, _FIRST = range(3)  # columns of numbers by track: looks at it, those that found it in the mask, frame
@@ -76,7 +77,7 @@ class Suspicion(Closing):
         if self._network is None:
             return tracks
         self._meet(tracks)
-        if tracks.position % _INTERVAL == 0:
+        if tracks.position % frames_in(_SECONDS, mapper.frame_rate) == 0:
             self._take_in()
             self._look = _Look(tracks.ids, tracks.pixels, self._pool.submit(read_mask, self._network, frame))
             if tracks.position == 0:  # the map may start here

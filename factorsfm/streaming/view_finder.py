@@ -12,12 +12,13 @@ from factorsfm.mapping.map_registration import visible
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.mapping.mapper import Mapper
 from factorsfm.streaming.relocalization import KeyframeView, Relocalizer
+from factorsfm.support.pace import frames_in
 from factorsfm.tracks.flow import FlowTracker
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-_REVIVAL_INTERVAL = 5  # frames
+_REVIVAL_SECONDS = 0.2  # between two looks for ended tracks that may be back in view
 
 
 class ViewFinder:
@@ -35,7 +36,7 @@ class ViewFinder:
     def expected(self, mapper: Mapper) -> tuple[Index, Array] | None:
         """Now and then, the ended tracks that the last image should show, and where (pixels)."""
         last = mapper.images[-1] if mapper.images else None
-        if last is None or not last.registered or len(mapper.images) % _REVIVAL_INTERVAL:
+        if last is None or not last.registered or len(mapper.images) % frames_in(_REVIVAL_SECONDS, mapper.frame_rate):
             return None
         return self._in_view(mapper, last)
 

@@ -62,10 +62,10 @@ class MapperOptions:
         min_inliers: fewest inliers of a registered frame.
         inlier_px: largest reprojection error of an inlier at registration; larger while the map is still inaccurate.
         keyframe_flow: median flow since the last keyframe that makes the next one, as a share of the image width.
-        keyframe_interval: most frames between two keyframes.
+        keyframe_seconds: longest time between two keyframes, while they are few.
         landmarks: most landmarks that a keyframe observes in the graph.
         graph_iterations: iterations of the graph at a keyframe.
-        graph_delay: frames between a keyframe and the one at which the map takes over its update; more once the map has
+        graph_delay_seconds: time from a keyframe until the map takes over its update; more once the map has
             converged. Until then the graph works in parallel with the registration.
         pixel_sigma: standard deviation of a tracked point in the graph (pixels).
         essential_angle_deg: median triangulation angle that a start without depth needs.
@@ -80,10 +80,10 @@ class MapperOptions:
     min_inliers: int = 15
     inlier_px: float = 3.0
     keyframe_flow: float = 0.02
-    keyframe_interval: int = 12
+    keyframe_seconds: float = 0.5
     landmarks: int = 600
     graph_iterations: int = 1
-    graph_delay: int = 3
+    graph_delay_seconds: float = 0.125
     pixel_sigma: float = 0.25
     essential_angle_deg: float = 1.0
 

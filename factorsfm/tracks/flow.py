@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 from factorsfm.support.context import Closing
 from factorsfm.support.options import TrackerOptions
+from factorsfm.support.pace import USUAL_RATE, frames_in
 from factorsfm.tracks.corners import new_corners
 from factorsfm.tracks.frame_flow import FrameFlow, robust_fit
 from factorsfm.tracks.grey import GreyFrame, match_exposure
@@ -45,9 +46,9 @@ _CHECK_INTERVAL = 2  # frames: the alignment of every track is checked backward 
 _SURPRISE_PX, _SURPRISE_RATIO = 0.5, 3.0  # largest distance from the prediction, and the same over the median distance
 _OTHERWISE_PX, _OTHERWISE_RATIO = 2.0, 5.0  # least distance from the motion of the image, and the same over the median
 _MAJORITY = 0.5  # share of the tracks that are found; with fewer, the prediction is wrong
-_AWAY_FRAMES = 48  # after which a track that left the view may be revived: only a camera that returns sees it again
+_AWAY_SECONDS = 2.0  # after which a track that left the view may be revived: only a camera that returns sees it again
 _REVIVAL_REACH = 2.0  # times that of a re-alignment: the place of a revived track is less certain
-_REPLENISH_INTERVAL = 3  # frames between two searches for corners ...
+_REPLENISH_SECONDS = 0.125  # between two searches for corners ...
 _REPLENISH_SHARE = 0.7  # ... unless a smaller share of `max_tracks` is alive
 
 
@@ -71,10 +72,14 @@ class TrackedFrame:
 
 
 class FlowTracker(Closing):
-    """Follows image points through a video, one frame at a time, in bounded memory."""
+    """Follows image points through a video, one frame at a time, in bounded memory.
+
+    Attributes:
+        frame_rate: of the video, frames a second.
+    """
 
     def __init__(self, options: TrackerOptions) -> None:
-        self.options = options
+        self.options, self.frame_rate = options, USUAL_RATE
         self._previous: GreyFrame | None = None
         self._texture = 0.0  # of the previous frame
         self._frame = 0
@@ -231,7 +236,7 @@ class FlowTracker(Closing):
         left = ~_inside(place, shape, self.options.border_px)
         if mask is not None:
             left |= _at(mask, place)
-        self._put_aside(np.nonzero(left)[0], self._frame + _AWAY_FRAMES)
+        self._put_aside(np.nonzero(left)[0], self._frame + frames_in(_AWAY_SECONDS, self.frame_rate))
         if found.mean() <= _MAJORITY:
             self._put_aside(np.nonzero(~found & ~left)[0], self._frame)
         self._tracks.keep(np.nonzero(found & ~left)[0])
@@ -246,7 +251,8 @@ class FlowTracker(Closing):
         room = o.max_tracks - alive
         if room < o.max_tracks * o.replenish_below:
             return 0
-        if alive > _REPLENISH_SHARE * o.max_tracks and self._frame - self._replenished < _REPLENISH_INTERVAL:
+        interval = frames_in(_REPLENISH_SECONDS, self.frame_rate)
+        if alive > _REPLENISH_SHARE * o.max_tracks and self._frame - self._replenished < interval:
             return 0
         self._replenished = self._frame
         corners = new_corners(frame, self._tracks.xy, self._avoided, mask, room, o)

@@ -105,6 +105,26 @@ def test_a_dissolve_ends_one_shot_and_begins_another(frames):
     assert find_shots(images) == [range(between[0]), range(second, 84 - frames)]
 
 
+def at(rate: float, images: list[np.ndarray]) -> list[Frame]:
+    return [Frame(k, image, f"{k:06d}", timestamp=k / rate) for k, image in enumerate(images)]
+
+
+def test_a_dissolve_takes_as_long_at_60_frames_a_second():
+    images = dissolve(shot(0, 100, speed=1), shot(1, 110, speed=1), 45)
+    first, second = find_shots(at(60.0, images))
+    assert first.start == 0
+    assert 55 + 10 <= first.stop <= 55 + 45
+    assert 55 + 22 <= second.start <= 100 + 13
+    assert second.stop == len(images)
+
+
+def test_a_flash_takes_as_long_at_60_frames_a_second():
+    images = shot(0, 60, speed=1)
+    images[30:38] = shot(1, 8)  # 0.13 seconds; as many frames at 24 a second are another shot
+    assert find_shots(at(60.0, images)) == [range(60)]
+    assert len(find_shots(at(24.0, images))) == 3
+
+
 def test_what_only_resembles_a_dissolve_is_no_cut():
     images, grey = shot(0, 40, speed=2), np.full((HEIGHT, WIDTH, 3), 150, np.uint8)
     ramp = np.clip((np.arange(40) - 12) / 12, 0, 1)

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from factorsfm.frames.repeats import RepeatDetector
-from factorsfm.frames.timing import are_uneven, cadence, frame_interval, frame_times
+from factorsfm.frames.timing import Pace, are_uneven, cadence, frame_interval, frame_times
+from factorsfm.support.pace import frames_in
 from tests.video_files import moving_texture
 
 
@@ -111,3 +112,26 @@ def test_a_fade_hides_no_repeat_and_makes_none(frames):
         detector = RepeatDetector()
         found = [detector.push(np.round(images[k] * ramp[k]).astype(np.uint8)) for k in shown]
         assert found == [k > 0 and shown[k] == shown[k - 1] for k in range(len(shown))]
+
+
+@pytest.mark.parametrize(
+    ("stamps", "rate"),
+    [
+        ([k / 60 for k in range(30)], 60.0),
+        ([round(k / 23.976, 3) for k in range(30)], 23.976),
+        ([None] * 9, 24.0),
+        ([0.0, 0.5, 1.0, 1.5], 12.0),  # photographs one after another
+        ([0.0], 24.0),
+        ([k / 60 if k < 40 else 40 / 60 + (k - 40) / 24 for k in range(80)], 24.0),  # the newest frames count
+    ],
+)
+def test_the_rate_of_a_source_is_that_of_its_timestamps(stamps, rate):
+    pace = Pace()
+    assert [pace.push(k, stamp) for k, stamp in enumerate(stamps)][-1] == pytest.approx(rate, rel=0.01)
+    assert Pace(pace.state()).push(len(stamps), None) == 24.0
+    assert pace.rate == pytest.approx(rate, rel=0.01)
+
+
+def test_a_time_is_a_number_of_frames_of_at_least_one():
+    assert [frames_in(0.5, rate) for rate in (12.0, 23.976, 24.0, 60.0)] == [6, 12, 12, 30]
+    assert frames_in(0.01, 24.0) == 1

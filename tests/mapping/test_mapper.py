@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from factorsfm.graph.process import GraphProcess
+from factorsfm.mapping.keyframes import is_keyframe, update_delay
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.mapping.mapper import Mapper
 from factorsfm.support.options import Options
@@ -82,3 +83,17 @@ def test_rotations_stay_rotations_however_long_the_shot():
     rotation = np.array([image.rotation for image in mapper.images])
     product = rotation @ rotation.transpose(0, 2, 1)
     np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), product.shape), atol=1e-12)
+
+
+@pytest.mark.parametrize(("rate", "interval", "delay"), [(12.0, 6, 2), (24.0, 12, 5), (60.0, 30, 12)])
+def test_keyframes_come_after_a_time_and_not_after_a_number_of_frames(rate, interval, delay):
+    """Of a camera that hardly moves; the graph has the same time for each of them."""
+    problem = make_problem("truck", frames=interval + 2, points=200, parallax=0.001, noise_px=0.1)
+    images = [tracks_at(k, *problem.of_frame(k)) for k in range(problem.frames)]
+    options = Options().mapper
+    width = round(2 * problem.focal)
+    wanted = [
+        is_keyframe(image, images[0], 19, problem.focal, width, options, rate=rate, rough=False) for image in images[1:]
+    ]
+    assert wanted.index(True) + 1 == interval
+    assert update_delay(19, options, rate) == delay

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from factorsfm import Frame, FrameStatus, InputError, ModelError, Options, Reconstruction, Stream
-from factorsfm.streaming.suspicion import _INTERVAL
+from factorsfm.streaming.suspicion import _SECONDS
 from factorsfm.synthetic import RenderedShot, render_shot, simulate_prior
 from tests.rendered import Maps, errors_of, with_fewer_tracks
+
+_INTERVAL = frames_in(_SECONDS, USUAL_RATE)
 
 COUNT, SIZE = 30, (320, 180)
 QUICK = with_fewer_tracks(Options(), 400)
@@ -94,7 +96,7 @@ def test_a_statue_is_not_lost():
 
 
 def test_a_statue_votes_before_the_end():
-    options = replace(QUICK, mapper=replace(QUICK.mapper, keyframe_interval=3))  # the map grows up in these frames
+    options = replace(QUICK, mapper=replace(QUICK.mapper, keyframe_seconds=0.125))  # the map grows up in these frames
     with Stream(shot().camera, depth=Maps(maps()), masks=Network(half), options=options) as stream:
         left = []
         for image in shot().images:
