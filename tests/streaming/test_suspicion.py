@@ -9,6 +9,7 @@ import pytest
 
 from factorsfm import Frame, FrameStatus, InputError, ModelError, Options, Reconstruction, Stream
 from factorsfm.streaming.suspicion import _SECONDS
+from factorsfm.support.pace import USUAL_RATE, frames_in
 from factorsfm.synthetic import RenderedShot, render_shot, simulate_prior
 from tests.rendered import Maps, errors_of, with_fewer_tracks
 
