@@ -24,7 +24,7 @@ from factorsfm.adjustment.residuals import cauchy
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-STRETCH = 16  # frames
+STRETCH = 16  # frames: with fewer, the persistent part and the white one can hardly be told apart
 _CLIP = 4.0  # standard deviations at which errors are clipped before their correlation is measured
 _SHRINKAGE = 60.0  # pairs of observations that the mean over all tracks counts for
 

@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 _GROSS = 4.0  # times the threshold of an inlier: a young map is wrong, too, and long tracks are precious
-_REACH = 60  # images to both sides of a lost one from which its tracks are triangulated
+_REACH = 60  # images to both sides of a lost one from which its tracks are triangulated: more tell hardly more
 _FARTHEST = 1e-6  # smallest inverse distance of a point
 _ALONE_ITERATIONS = 4
 _JUDGED_VIEWS = 3  # keyframes that must see a suspect: two leave its depth a free choice
