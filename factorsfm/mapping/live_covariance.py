@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.mapping.mapped_images import MappedImage, nearest_registered
-from factorsfm.support.rotations import cross_matrices
+from factorsfm.support.rotations import adjoint
 
 Array = NDArray[np.float64]
 
@@ -61,11 +61,8 @@ def window_covariance(pose: tuple[Array, Array], given: Array, constant: Sequenc
 def carried(covariance: Array, origin: tuple[Array, Array], pose: tuple[Array, Array]) -> Array:
     """(6, 6) of what is uncertain in the pose `origin`, in the camera of another pose that moves with it."""
     turn = pose[0] @ origin[0].T
-    shift = pose[1] - turn @ origin[1]
-    adjoint = np.zeros((6, 6))
-    adjoint[:3, :3] = adjoint[3:, 3:] = turn
-    adjoint[3:, :3] = cross_matrices(shift[None])[0] @ turn
-    return np.asarray(adjoint @ covariance @ adjoint.T)
+    through = adjoint(turn, pose[1] - turn @ origin[1])
+    return np.asarray(through @ covariance @ through.T)
 
 
 def _places(keyframes: Sequence[MappedImage], center: Array) -> int:

@@ -12,7 +12,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from factorsfm.polish.polished import Polished
-from factorsfm.support.rotations import cross_matrices
+from factorsfm.support.rotations import adjoint, cross_matrices
 
 Array = NDArray[np.float64]
 
@@ -34,19 +34,11 @@ def smooth_error_covariance(polished: Polished, width: int) -> Array:
         for rotation, translation in zip(state.rotation, state.translation, strict=True)
     ]
     # An error of the first pose is seen in all others, which are relative to it.
-    carried = np.array([adjoint(pose * cam_from_object[0].inverse()) for pose in cam_from_object])
+    relative = [pose * cam_from_object[0].inverse() for pose in cam_from_object]
+    carried = np.array([adjoint(pose.rotation.matrix(), pose.translation) for pose in relative])
     found += carried @ found[0] @ carried.transpose(0, 2, 1)
     found[0] = 0.0
     return found
-
-
-def adjoint(pose: pycolmap.Rigid3d) -> Array:
-    """(6, 6) of a pose, for perturbations (rotation vector, translation)."""
-    rotation = pose.rotation.matrix()
-    adjoint = np.zeros((6, 6))
-    adjoint[:3, :3] = adjoint[3:, 3:] = rotation
-    adjoint[3:, :3] = cross_matrices(pose.translation[None])[0] @ rotation
-    return adjoint
 
 
 def _by_frame(polished: Polished, width: int) -> Array:

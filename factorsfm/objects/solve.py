@@ -14,12 +14,13 @@ from factorsfm.objects.growth import grown
 from factorsfm.objects.object_result import ObjectFrame, ObjectResult
 from factorsfm.objects.rest import Sighting, scale_at_rest
 from factorsfm.objects.scale import PriorOnScene, Scale, scale_from_prior
-from factorsfm.objects.smooth_errors import adjoint, smooth_error_covariance
+from factorsfm.objects.smooth_errors import smooth_error_covariance
 from factorsfm.objects.start import LEAST_FRAMES, LEAST_TRACKS, object_start
 from factorsfm.polish.polish import polish
 from factorsfm.polish.polished import Polished
 from factorsfm.support.errors import ReconstructionError
 from factorsfm.support.options import Options
+from factorsfm.support.rotations import adjoint
 from factorsfm.support.similarity import covariance_in_unit
 from factorsfm.support.status import ShotKind
 from factorsfm.tracks.image_tracks import ImageTracks, seen_by
@@ -141,7 +142,8 @@ def _result(
         for rotation, translation in zip(state.rotation, state.translation, strict=True)
     ]  # cam_from_object, in units of the object
     # `object_from_cam`, perturbed on the right, is seen from the other side.
-    carried = np.array([adjoint(pose.inverse()) for pose in poses])
+    inverse = [pose.inverse() for pose in poses]
+    carried = np.array([adjoint(pose.rotation.matrix(), pose.translation) for pose in inverse])
     covariance = polished.covariance + smooth_error_covariance(polished, images[0].camera.width)
     covariance = carried @ covariance @ carried.transpose(0, 2, 1)
     scale = scale_at_rest(_sighting(poses, covariance, seen)) or _scale(polished, images, seen)

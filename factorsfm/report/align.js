@@ -48,8 +48,7 @@ function command() {
 }
 
 function copyAlignment() {
-  getSelection().selectAllChildren(byId("command"));
-  say(document.execCommand("copy") ? "Copied." : "The command is selected: copy it.");
+  say(copied(byId("command")) ? "Copied." : "The command is selected: copy it.");
 }
 
 function showAlignment() {

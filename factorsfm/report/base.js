@@ -8,6 +8,13 @@ const quantile = (sorted, q) => sorted.length ? sorted[Math.round(q * (sorted.le
 const format = x => x === null ? "–" : x && Math.abs(x) < 1e-3 ? Number(x.toPrecision(3)).toExponential() : Number(x.toPrecision(4)).toString();
 const roundLength = most => [5, 2, 1].map(f => f * 10 ** Math.floor(Math.log10(most))).find(l => l <= most * 1.0001);
 
+// Selects an element and copies its text; whether the browser lets it.
+function copied(element) {
+  if (element.select) element.select();
+  else getSelection().selectAllChildren(element);
+  return document.execCommand("copy");
+}
+
 const frameCount = data.frame.length, last = Math.max(frameCount - 1, 1);
 const solved = Boolean(data.positions && data.positions.length);
 const hasTracks = solved && data.tracks.start[frameCount] > 0;

@@ -66,15 +66,8 @@ function choose(row, chosen) {
   showCommand();
 }
 
-async function copyCommand() {
-  const field = byId("mend_command");
-  try {
-    await navigator.clipboard.writeText(field.value);
-  } catch {
-    field.select();
-    document.execCommand("copy");
-  }
-  byId("mend_copy").textContent = "Copied";
+function copyCommand() {
+  byId("mend_copy").textContent = copied(byId("mend_command")) ? "Copied" : "Selected";
 }
 
 function trackRow(row) {

@@ -62,6 +62,14 @@ def right_jacobian(rotation_vector: Array) -> Array:
     return np.asarray(np.eye(3) - half * hat + sixth * (hat @ hat))
 
 
+def adjoint(rotation: Array, translation: Array) -> Array:
+    """(6, 6) that carries perturbations (rotation vector, translation) through a pose: (3, 3) and (3,)."""
+    found = np.zeros((6, 6))
+    found[:3, :3] = found[3:, 3:] = rotation
+    found[3:, :3] = cross_matrices(translation[None])[0] @ rotation
+    return found
+
+
 def nearest_rotation(matrix: Array) -> Array:
     """The rotation (3, 3) nearest to a matrix (3, 3) in the Frobenius norm: its projection to SO(3)."""
     u, _, vt = np.linalg.svd(matrix)
