@@ -69,8 +69,10 @@ class Chromium:
             self._receive()
 
     def run(self, script: str) -> Any:
-        """The value of a JavaScript expression, awaited."""
-        answer = self._ask("Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True)
+        """The value of a JavaScript expression, awaited; what it does, the user does."""
+        answer = self._ask(
+            "Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True, userGesture=True
+        )
         assert "exceptionDetails" not in answer, answer["exceptionDetails"]
         return answer["result"].get("value")
 
