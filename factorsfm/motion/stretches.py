@@ -12,9 +12,11 @@ from itertools import groupby
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
-from factorsfm.motion.shot_kind import Motion, classify_motion
+from factorsfm.adjustment.some_frames import seen_in
+from factorsfm.motion.shot_kind import CLEAR_GAIN, Motion, classify_motion
 from factorsfm.support.options import PolishOptions
 from factorsfm.support.status import ShotKind
 
@@ -22,6 +24,7 @@ _Value = TypeVar("_Value")
 
 _SHORTEST = 12  # frames of a stretch: half a second, in which the slowest moves of a camera in use can be seen
 _ITERATIONS = 3  # until the poses of a stretch are at their best for it alone
+_FEW = 4  # frames of a stretch that are asked first
 _MOST_BLOCKS = 24  # of a long shot, which then has longer ones
 
 
@@ -86,17 +89,23 @@ def _runs(values: list[_Value]) -> list[tuple[int, int, _Value]]:
 
 
 def _kind_of_frames(solved: BundleAdjustment, first: int, end: int, options: PolishOptions) -> ShotKind:
-    """Of the frames from one to before another, by themselves."""
-    o = solved.observations
-    rows = (o.frame >= first) & (o.frame < end)
-    rows &= (np.bincount(o.point[rows], minlength=len(solved.state.bearing)) >= 2)[o.point]
-    points, point = np.unique(o.point[rows], return_inverse=True)
-    if not len(points):
+    """Of the frames from one to before another, by themselves; where a few of them move clearly, they all do."""
+    few = _alone(solved, np.unique(np.linspace(first, end - 1, _FEW).astype(int)), options)
+    if few is not None and classify_motion(few, options).gain > CLEAR_GAIN:
+        return ShotKind.GENERAL
+    alone = _alone(solved, np.arange(first, end), options)
+    if alone is None:
         return ShotKind.STATIC
-    part = solved.state.seen_from(first).of(points).in_frames(np.arange(first, end))
-    few = o.at(rows, frame=o.frame[rows] - first, point=point)
-    alone = BundleAdjustment(part, few, options, solved.errors)
     if (kind := classify_motion(alone, options).kind) is ShotKind.GENERAL:  # even with the poses of the whole shot
         return kind
     alone.solve(_ITERATIONS)
     return classify_motion(alone, options).kind
+
+
+def _alone(solved: BundleAdjustment, frames: NDArray[np.int64], options: PolishOptions) -> BundleAdjustment | None:
+    """Some frames (ascending) with the poses of the whole shot, None where no two of them see the same point."""
+    seen, points = seen_in(frames, solved.observations)
+    if not len(points):
+        return None
+    state = solved.state.seen_from(int(frames[0])).of(points).in_frames(frames)
+    return BundleAdjustment(state, seen, options, solved.errors)
