@@ -17,6 +17,7 @@ Array = NDArray[np.float32]
 _LONGER_SIDE = 96
 _BLOCK = 18
 _OWN_REACH = 9  # largest displacement of a block by itself
+_SLOW_REACH, _HARDLY_CHANGED = 2, 0.02  # the same that is tried first, and the dissimilarity below which it is enough
 _COMMON_REACH = 0.35  # largest displacement common to all blocks, as a share of the image
 _PARALLAX = 3  # how far a block may be off the common displacement: parallax, rotation, zoom
 _OVERLAP = 0.6  # share of the blocks that must be in view after the common displacement
@@ -95,10 +96,12 @@ def dissimilarity(first: Thumbnail, second: Thumbnail) -> float:
     usable = np.flatnonzero(first.textured & second.textured)
     if len(usable) < _LEAST_TEXTURED * len(first.blocks):
         return 1.0
-    near = _correlations(first, second, usable, _OWN_REACH, _OWN_REACH)
-    by_themselves = 1.0 - float(np.median(near.max(axis=(1, 2))))
-    if by_themselves < _SAME_VIEW:  # the usual case
-        return max(by_themselves, 0.0)
+    by_themselves = 1.0
+    for reach, enough in ((_SLOW_REACH, _HARDLY_CHANGED), (_OWN_REACH, _SAME_VIEW)):  # a longer search is seldom needed
+        near = _correlations(first, second, usable, reach, reach)
+        by_themselves = 1.0 - float(np.median(near.max(axis=(1, 2))))
+        if by_themselves < enough:
+            return max(by_themselves, 0.0)
     height, width = first.pixels.shape
     far = _correlations(first, second, usable, round(_COMMON_REACH * width), round(_COMMON_REACH * height))
     inside = np.isfinite(far)
