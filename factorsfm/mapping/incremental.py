@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from factorsfm.adjustment.gather import gather
 from factorsfm.mapping.depth_fallback import DepthGuidance
+from factorsfm.mapping.live_covariance import doubt
 from factorsfm.mapping.map_copy import MapUpdate
 from factorsfm.mapping.map_registration import NotOnMap, register_on_map
 from factorsfm.mapping.mapped_images import MappedImage, refocus, state_of
@@ -69,6 +70,7 @@ class IncrementalMapper:
         """Give an image its pose."""
         image.rotation, image.translation = found.rotation, found.translation
         image.inliers, image.threshold = int(found.inliers.sum()), found.threshold
+        image.mapped = int(self.points.contains(image.tracks.ids).sum())
         image.status = FrameStatus.REGISTERED
         image.message = f"{image.inliers} inliers within {found.threshold:.1f} pixels"
         if found.affine is not None:
@@ -92,7 +94,7 @@ class IncrementalMapper:
         for position, pose in update.poses.items():
             self.images[position].rotation, self.images[position].translation = pose
         for position, covariance in update.covariances.items():
-            self.images[position].covariance = covariance
+            self.images[position].covariance = covariance + doubt(self.images[position], self.images)
         for position, affine in update.affines.items():
             self.images[position].affine = affine
 

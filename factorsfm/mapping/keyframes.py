@@ -17,8 +17,9 @@ Array = NDArray[np.float64]
 
 _LEAST_SHARED = 0.7  # of the tracks of the last keyframe; with fewer, a new one is made
 _SETTLED, _SETTLED_DELAY = 5, 1.0 / 12.0  # keyframes of a map that changes little; how much longer it waits, seconds
-_ROUGH, _CONTRADICTED, _LATELY = 1.5, 0.8, 5  # ratios of the spread of the errors, and of the share of tracks that
-# agree, to those of the best of so many images before
+# Ratios of the spread of the errors, and of the share of tracks that agree, to those of the best of so many images
+# before. In a map that changes little nearly all agree: there, that fewer do is enough.
+_ROUGH, _CONTRADICTED, _LATELY = 1.5, 0.85, 5
 
 
 def is_keyframe(
@@ -54,8 +55,8 @@ def update_delay(count: int, options: MapperOptions, rate: float) -> int:
 def suddenly_rough(image: MappedImage, images: Sequence[MappedImage], count: int) -> bool:
     """Whether a registered image fits the map far worse than those just before it.
 
-    Fewer of its tracks agree, and not as well. A damaged, blurred or flashed image passes, and must not bend the map.
-    Where the map itself is wrong, the images stay rough, and one of them becomes a keyframe.
+    Fewer of its tracks agree, and in a young map not as well. A damaged, blurred or flashed image passes, and must not
+    bend the map. Where the map itself is wrong, the images stay rough, and one of them becomes a keyframe.
 
     Args:
         images: all, in order of time, at least those before it.
@@ -66,9 +67,14 @@ def suddenly_rough(image: MappedImage, images: Sequence[MappedImage], count: int
     lately = [other for other in images[max(0, position - _LATELY) : position] if other.registered]
     if not lately or count < 2:
         return False
-    best = min(lately, key=lambda other: other.threshold)
-    share = image.inliers / len(image.tracks.ids)
-    return image.threshold > _ROUGH * best.threshold and share < _CONTRADICTED * best.inliers / len(best.tracks.ids)
+    if _agreeing(image) >= _CONTRADICTED * max(map(_agreeing, lately)):
+        return False
+    return count >= _SETTLED or image.threshold > _ROUGH * min(other.threshold for other in lately)
+
+
+def _agreeing(image: MappedImage) -> float:
+    """Share of its tracks with a point that agree with the pose of an image."""
+    return image.inliers / max(image.mapped, 1)
 
 
 def carry(keyframe: MappedImage, before: tuple[Array, Array], followers: Sequence[MappedImage]) -> None:

@@ -28,11 +28,7 @@ def live_covariance(
         images: all; keyframes: positions of those whose covariance the graph may have given: what the map leaves open.
     """
     rotation, translation = image.pose
-    if image.rough:  # the whole step from the image beside it is in doubt
-        beside = nearest_registered(images, image.tracks.position).pose
-        turn = rotation @ beside[0].T
-        step = np.concatenate([cv2.Rodrigues(turn)[0].ravel(), translation - turn @ beside[1]])
-        on_map = on_map + np.outer(step, step)
+    on_map = on_map + doubt(image, images)
     solved = [images[k] for k in keyframes if images[k].covariance is not None]
     # What linearised covariances do not know of a young map: that its whole shape is still a guess.
     places = _places(solved, -rotation.T @ translation)
@@ -42,6 +38,19 @@ def live_covariance(
         return on_map
     assert solved[-1].covariance is not None
     return on_map + carried(solved[-1].covariance, solved[-1].pose, image.pose)
+
+
+def doubt(image: MappedImage, images: Sequence[MappedImage]) -> Array:
+    """(6, 6) of the pose of a rough image: as far as it is from the image beside it, in any direction; of others none.
+
+    That it is a keyframe makes it no more certain: what bends its pose is in the graph then.
+    """
+    if not image.rough:
+        return np.zeros((6, 6))
+    beside = nearest_registered(images, image.tracks.position).pose
+    turn = image.pose[0] @ beside[0].T
+    far = np.linalg.norm(cv2.Rodrigues(turn)[0]), np.linalg.norm(image.pose[1] - turn @ beside[1])
+    return np.diag(np.repeat(np.square(far), 3))
 
 
 def window_covariance(pose: tuple[Array, Array], given: Array, constant: Sequence[MappedImage]) -> Array:

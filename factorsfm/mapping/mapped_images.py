@@ -23,7 +23,8 @@ class MappedImage:
     """An image and what is known of its pose.
 
     Attributes:
-        inliers: tracks that agree with its pose; threshold: reprojection error up to which they do (pixels).
+        inliers: tracks that agree with its pose, of the `mapped` ones, which had a point when it was registered;
+            threshold: reprojection error up to which they do (pixels).
         rough: whether it fits far worse than the images before it, see `suddenly_rough`.
         affine: scale and shift of its depth prior beside the map.
         covariance: (6, 6) of the pose as it was registered, or as the graph has it for a keyframe.
@@ -36,6 +37,7 @@ class MappedImage:
     translation: Array | None = None
     keyframe: bool = False
     inliers: int = 0
+    mapped: int = 0
     threshold: float = 0.0
     rough: bool = False
     affine: tuple[float, float] | None = None

@@ -302,7 +302,7 @@ class Mapper(IncrementalMapper):
             image.message += f"; not found again: {agree}" if agree else ""
             return False
         self._accept(image, replace(result, inliers=np.zeros(len(image.tracks.ids), bool)))
-        image.inliers = int(result.inliers.sum())
+        image.inliers, image.rough = int(result.inliers.sum()), False
         image.message = f"found again: {agree}"
         return True
 

@@ -21,7 +21,14 @@ POSE = exponential(np.array([[-0.2, 0.4, 0.1]]))[0], np.array([-0.4, 0.2, 1.0])
 def image(position: int, *, threshold: float = 3.0, inliers: int = 90, pose=POSE, covariance=None) -> MappedImage:
     tracks = ImageTracks(position, np.arange(100), np.zeros((100, 2)), CAMERA)
     return MappedImage(
-        tracks, FrameStatus.REGISTERED, "", *pose, inliers=inliers, threshold=threshold, covariance=covariance
+        tracks,
+        FrameStatus.REGISTERED,
+        "",
+        *pose,
+        inliers=inliers,
+        mapped=100,
+        threshold=threshold,
+        covariance=covariance,
     )
 
 
@@ -64,9 +71,17 @@ def test_the_uncertainty_of_constant_keyframes_is_that_of_what_hangs_on_them() -
 
 @pytest.mark.parametrize(
     ("threshold", "inliers", "keyframes", "rough"),
-    [(6.0, 50, 2, True), (6.0, 90, 2, False), (3.5, 50, 2, False), (6.0, 50, 1, False)],
+    [
+        (6.0, 50, 2, True),
+        (6.0, 90, 2, False),
+        (3.5, 50, 2, False),
+        (6.0, 50, 1, False),
+        (3.0, 70, 5, True),
+        (3.0, 80, 5, False),
+        (3.0, 70, 4, False),
+    ],
 )
-def test_an_image_is_rough_where_fewer_tracks_agree_and_less_well(
+def test_an_image_is_rough_where_fewer_tracks_agree_and_in_a_young_map_less_well(
     threshold: float, inliers: int, keyframes: int, rough: bool
 ) -> None:
     before = [image(k, threshold=9.0 if k < 2 else 3.0) for k in range(7)]
