@@ -110,11 +110,13 @@ def polish_start(
 
 def _core(shot: Shot, frames: list[int], observations: Observations, tracks: Index, options: Options) -> Core:
     """Cameras, lens and shutter on the longest tracks; of a long shot on few of the frames first."""
-    rows = core_frames(observations, len(frames)) if shot.in_time else np.arange(len(frames))
+    rows = np.arange(len(frames))
+    if shot.in_time and options.lens != "zoom":  # between two frames, a zoom may change its speed
+        rows = core_frames(observations, len(frames))
     if len(rows) < len(frames):
         few, points = seen_in(rows, observations)
         core = _solved_core(shot, [frames[row] for row in rows], few, tracks[points], options)
-        if core.lens is None or not core.lens.zooms:  # between two frames, a zoom may change its speed
+        if core.lens is None or not core.lens.zooms:
             core = replace(core, points=points[core.points], left_out=points[core.left_out])
             return _in_all_frames(core, rows, shot, frames, observations, options)
     return _solved_core(shot, frames, observations, tracks, options)
