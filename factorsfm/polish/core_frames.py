@@ -19,6 +19,7 @@ Index = NDArray[np.int64]
 # lenses, with and without translation. More frames hardly make lens and motion more certain, since the errors of tracks
 # persist from one to the next.
 _FRAMES = 60
+_CLEARLY_FEWER = 1.25  # times as many frames as that: fewer save nothing, since all of them have to follow
 _IN_COMMON = 0.25  # of the tracks of a frame, which the one before it sees, too: a hundred and more
 
 
@@ -29,7 +30,7 @@ def core_frames(observations: Observations, frames: int) -> Index:
     """
     lost = _in_common(observations, np.arange(frames)) < _IN_COMMON
     limit = _FRAMES
-    while limit < frames:
+    while _CLEARLY_FEWER * limit < frames:
         rows = np.linspace(0, frames - 1, limit).astype(int)
         enough = _in_common(observations, rows) >= _IN_COMMON
         if (enough | np.logical_or.reduceat(lost, rows[:-1])).all():

@@ -44,8 +44,11 @@ def test_a_view_that_is_lost_asks_for_no_more_frames():
     assert len(core_frames(both, 400)) == 60
 
 
-def test_a_short_shot_is_solved_on_all_frames():
-    np.testing.assert_array_equal(core_frames(tracks_of(3, 48), 48), np.arange(48))
+@pytest.mark.parametrize(("frames", "expected"), [(48, 48), (75, 75), (76, 60)])
+def test_a_short_shot_is_solved_on_all_frames(frames, expected):
+    rows = core_frames(tracks_of(12, frames), frames)
+    assert len(rows) == expected
+    assert rows[-1] == frames - 1
 
 
 def polished(motion, lens, monkeypatch, few):
