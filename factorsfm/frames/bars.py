@@ -102,10 +102,11 @@ def _edges(grey: NDArray[np.uint8], reach: list[int | None]) -> list[tuple[int, 
     # With bars on all sides, the ends of a line are those of the picture.
     across, along = _extent(lit.T), _extent(lit)
     found: list[tuple[int, bool]] = []
+    reaches = iter(reach)
     for lines, (first, last) in ((columns, along), (rows, across)):
         length = lines.shape[1]
         picture = lines[:, int(first * length) : max(int(first * length) + 1, int(last * length))]
-        found += [_dark_lines(side[: reach[len(found) + k]], level) for k, side in enumerate((picture, picture[::-1]))]
+        found += [_dark_lines(side[: next(reaches)], level) for side in (picture, picture[::-1])]
     return found
 
 

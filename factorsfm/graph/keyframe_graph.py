@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from factorsfm.graph.added_factors import NOTHING_ADDED, AddedFactors, misfit_of
 from factorsfm.graph.live_isam import LiveIsam
+from factorsfm.graph.open_lens import with_free_lens
 from factorsfm.graph.window import Window
 
 Array = NDArray[np.float64]
@@ -104,7 +105,7 @@ class KeyframeGraph:
         if not window.open_lens or live.free_lens or len(window.keyframes) < self._opens_lens_from:
             return live, window
         try:
-            found = live.with_free_lens(window)
+            found = with_free_lens(live, window)
             if found is not None and not _fault(found[1], window.focal):
                 return found
         except Exception as error:

@@ -47,10 +47,6 @@ _SIZE_SIGMA = 1e-4  # relative, of the distance that holds the unit of length
 LANDMARK_SIGMA = 3.0  # of the weak prior of a landmark, in units of its distance
 _DEPTHS = 100  # depth factors of a keyframe, beside one for each landmark that has none yet: errors of a network repeat
 _FREE_LENS = 0.3  # relative standard deviation of a focal length that is estimated
-_LENS_STD = 0.0022  # relative, of independent observations, with which a focal length counts as determined
-_NEARLY = 1.2  # times that, beyond which further steps do not lead there
-_LENS_STEPS, _LENS_TOLERANCE = 6, 1e-4
-_LENS_STEP = 0.03  # of the logarithm of the focal length, that can be made in one go
 _LANDMARK = ord("l")  # character of the symbols L
 
 
@@ -114,7 +110,7 @@ class LiveIsam:
         last = self._apply(changes)
         for _ in range(iterations - 1):
             self._isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), [], last)
-        return self._solved(window)
+        return self.solved(window)
 
     def _apply(self, changes: Changes) -> gtsam.KeyGroupMap:
         """One step of iSAM2, with what changes; what it eliminates last."""
@@ -123,46 +119,21 @@ class LiveIsam:
         changes.settle(np.array(result.getNewFactorsIndices(), np.int64))
         return last
 
-    def with_free_lens(self, window: Window) -> tuple[LiveIsam, Window] | None:
-        """A copy in which the focal length is estimated, and the window with its values; None where it stays open.
-
-        Where a first step goes far, the focal length is led there a little at a time: in one go the reprojections would
-        be so far off that the robust kernel drops them.
-        """
-        live = self.copy()
-        live._free_lens()
-        if live.focal_std() > 2.0 * _LENS_STD:
-            return None
-        before, after = window.focal, live._estimated_focal()
-        if (steps := int(abs(np.log(after / before)) / _LENS_STEP)) > 0:
-            live = self.copy()
-            for focal in np.geomspace(before, after, steps + 2)[1:].tolist():
-                live._set_lens_prior(focal, HELD)
-            live._free_lens()
-            if live.focal_std() > _NEARLY * _LENS_STD:
-                return None
-        for _ in range(_LENS_STEPS):
-            before = live._estimated_focal()
-            live._free_lens()
-            if abs(live._estimated_focal() / before - 1.0) < _LENS_TOLERANCE:
-                break
-        solved = live._solved(window)
-        return (live, solved) if live.focal_std() < _LENS_STD else None
-
-    def _free_lens(self) -> None:
+    def step_with_free_lens(self) -> None:
+        """Estimate the focal length from here on, and make a step."""
         self.free_lens = True
-        focal = self._estimated_focal()
+        focal = self.estimated_focal()
         self._set_lens_prior(focal, _FREE_LENS * focal)
 
+    def step_with_held_lens(self, focal: float) -> None:
+        """Hold another focal length (pixels), and make a step."""
+        self._set_lens_prior(focal, HELD)
+
     def _set_lens_prior(self, focal: float, sigma: float) -> None:
-        """Another prior of the focal length, and a step with it."""
         key, changes = K(0), Changes()
         changes.removed.append(self._priors[key])
         changes.add([lens_prior(key, focal, sigma)], partial(self._note_prior, key))
         self._apply(changes)
-
-    def _estimated_focal(self) -> float:
-        return float(self.estimate().atCal3_S2(K(0)).fx())
 
     def _eliminated_last(self, changes: Changes) -> gtsam.KeyGroupMap:
         """Poses and affines, after the landmarks.
@@ -347,7 +318,8 @@ class LiveIsam:
 
     # --- values ---------------------------------------------------------------------------------------------------
 
-    def _solved(self, window: Window) -> Window:
+    def solved(self, window: Window) -> Window:
+        """The window with the values as they are estimated now."""
         estimate = self.estimate()
         rotation, translation = window.rotation.copy(), window.translation.copy()
         for row in np.flatnonzero(~window.constant).tolist():
@@ -390,6 +362,10 @@ class LiveIsam:
     def estimate(self) -> gtsam.Values:
         """Of all variables."""
         return self._isam.calculateEstimate()
+
+    def estimated_focal(self) -> float:
+        """Of an unknown lens, pixels."""
+        return float(self.estimate().atCal3_S2(K(0)).fx())
 
     def focal_std(self) -> float:
         """Relative standard deviation of the focal length."""
