@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import astuple, dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -100,7 +101,7 @@ def _edges(grey: NDArray[np.uint8], reach: list[int | None]) -> list[tuple[int, 
     if not lit.any():
         return []
     # With bars on all sides, the ends of a line are those of the picture.
-    across, along = _extent(lit.T), _extent(lit)
+    across, along = _extent(_shares_of_true(lit, along=0)), _extent(_shares_of_true(lit))
     found: list[tuple[int, bool]] = []
     reaches = iter(reach)
     for lines, (first, last) in ((columns, along), (rows, across)):
@@ -110,10 +111,9 @@ def _edges(grey: NDArray[np.uint8], reach: list[int | None]) -> list[tuple[int, 
     return found
 
 
-def _extent(lit: NDArray[np.bool_]) -> tuple[float, float]:
-    """First and last line that text alone does not light, as shares of all lines."""
-    share = lit.mean(axis=1)
-    places = np.flatnonzero(share > _PICTURE * share.max())
+def _extent(lit: NDArray[np.float64]) -> tuple[float, float]:
+    """First and last line that text alone does not light, as shares of all lines; lit: (n,) share of each."""
+    places = np.flatnonzero(lit > _PICTURE * lit.max())
     return float(places[0]) / len(lit), float(places[-1] + 1) / len(lit)
 
 
@@ -131,5 +131,11 @@ def _dark_lines(lines: NDArray[np.uint8], level: int) -> tuple[int, bool]:
 def _shares(above: NDArray[np.bool_]) -> NDArray[np.float64]:
     """(2, n) shares of what is above a level, at the ends of n lines and in all of each."""
     end = max(1, round(_CORNERS * above.shape[1]))
-    corners = 0.5 * (above[:, :end].mean(axis=1) + above[:, -end:].mean(axis=1))
-    return np.stack([corners, above.mean(axis=1)])
+    corners = 0.5 * (_shares_of_true(above[:, :end]) + _shares_of_true(above[:, -end:]))
+    return np.stack([corners, _shares_of_true(above)])
+
+
+def _shares_of_true(flags: NDArray[np.bool_], along: int = 1) -> NDArray[np.float64]:
+    """Share of True along an axis of (m, n) flags; OpenCV counts them ten times as fast as numpy."""
+    counts = cv2.reduce(flags.view(np.uint8), along, cv2.REDUCE_SUM, dtype=cv2.CV_32S)
+    return np.asarray(counts.ravel() / flags.shape[along])
