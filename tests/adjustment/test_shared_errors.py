@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from factorsfm.adjustment import shared_errors as module
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.columns import Columns
 from factorsfm.adjustment.marginals import in_scene_unit
@@ -40,6 +41,15 @@ def by_neighbourhood(shot, size, rng):
     """(m, 2) errors that the tracks of a neighbourhood have together, another in each frame; `size` in pixels."""
     o, label = shot.observations, _neighbourhoods(shot.truth.bearing)
     return size * rng.standard_normal((label.max() + 1, shot.frames, 2))[label[o.point], o.frame]
+
+
+def by_view(shot, size, rng):
+    """(m, 2) errors that grow along the path, quadratic in the place; `size` in pixels."""
+    o = shot.observations
+    x, y = (o.pixels / np.abs(o.pixels).max(0)).T
+    way = np.linalg.norm(shot.truth.translation, axis=1)  # of a path along a straight line, from the first camera
+    fields = np.stack([x, y, x * x, x * y, y * y], 1) * (way / way.max())[o.frame, None]
+    return size * fields @ rng.standard_normal((5, 2))
 
 
 def solved(shot, error):
@@ -82,6 +92,12 @@ def pose_blocks(error, covariance):
         yield error[k : k + 6], covariance[k : k + 6, k : k + 6]
 
 
+@pytest.fixture
+def no_errors_by_view(monkeypatch):
+    monkeypatch.setattr(module, "_BY_VIEW_PX", 0.0)
+
+
+@pytest.mark.usefixtures("no_errors_by_view")
 def test_of_independent_errors_covariances_are_at_most_twice_too_large(shot):
     """What single tracks do is in both parts of the covariance."""
     poses, points, alone, points_alone = ratios(shot, smooth, 0.0)
@@ -91,6 +107,7 @@ def test_of_independent_errors_covariances_are_at_most_twice_too_large(shot):
     assert 0.6 < points < 0.9
 
 
+@pytest.mark.usefixtures("no_errors_by_view")
 def test_smooth_errors_of_frames_are_in_the_covariance(shot):
     poses, points, alone, points_alone = ratios(shot, smooth, 0.2)
     assert alone > 20.0
@@ -99,12 +116,25 @@ def test_smooth_errors_of_frames_are_in_the_covariance(shot):
     assert 1.4 < points < 2.6  # of six frames each point shares the errors with its neighbours alone, too
 
 
+@pytest.mark.usefixtures("no_errors_by_view")
 def test_errors_of_neighbourhoods_are_in_the_covariance(shot):
     poses, points, alone, points_alone = ratios(shot, by_neighbourhood, 0.1)
     assert alone > 8.0
     assert 0.45 < poses < 1.0
     assert points_alone > 4.0
     assert 1.1 < points < 2.0
+
+
+@pytest.mark.parametrize("size", [0.1, 0.3])
+def test_errors_that_grow_with_the_change_of_view_are_in_the_covariance(shot, monkeypatch, size):
+    """No residual shows them: the solution takes them for another path and other distances."""
+    monkeypatch.setattr(module, "_BY_VIEW_PX", 0.0)
+    shown, *_ = ratios(shot, by_view, size)
+    monkeypatch.setattr(module, "_BY_VIEW_PX", size)
+    poses, points, *_ = ratios(shot, by_view, size)
+    assert shown > 5.0 * poses
+    assert 0.55 < poses < 0.85
+    assert 0.45 < points < 0.75
 
 
 def test_a_neighbourhood_moves_the_solution_as_far_as_without_it(shot):
