@@ -203,32 +203,29 @@ def _by_view(adjustment: BundleAdjustment, marginals: Marginals, term: Term) -> 
     o = adjustment.observations
     x, y = (o.pixels / np.maximum(np.abs(o.pixels).max(0), 1e-9)).T
     fields = _BY_VIEW_PX / adjustment.observation_sigmas()[0] * np.stack([x, y, x * x, x * y, y * y])
-    pulls, steps = [], []
-    for way in _ways(adjustment.state):
-        error = np.zeros((2, len(fields), 2, len(x)))  # along the rows of the image, and along its columns
-        error[0, :, 0] = error[1, :, 1] = fields * way[o.frame]
-        pull, step = _pulled(error.reshape(-1, 2, len(x)), marginals, term)
-        pulls.append(pull)
-        steps.append(step)
-    moved = marginals.camera @ np.concatenate(pulls, 1)
-    return np.asarray(moved), _nearer(marginals, np.concatenate(steps, 1), moved)
+    pulled = [_pulled(fields * way[o.frame], marginals, term) for way in _ways(adjustment.state)]
+    pull, step = (np.concatenate(parts, 1) for parts in zip(*pulled, strict=True))
+    moved = marginals.camera @ pull
+    return np.asarray(moved), _nearer(marginals, step, moved)
 
 
 def _pulled(error: Array, marginals: Marginals, term: Term) -> tuple[Array, Array]:
-    """(c, q) gradients of the camera side by q errors (q, 2, m) of the observations, in their standard deviations and
-    with the points eliminated, and (n, q) by which the inverse distances change on their own."""
+    """(c, 2 q) gradients of the camera side by q errors (q, m) of the observations along the rows of the image, and as
+    many along its columns, in their standard deviations and with the points eliminated, and (n, 2 q) by which the
+    inverse distances change on their own."""
     error = error if term.errors is None else term.errors.decorrelated(error)
-    pull = np.zeros((len(marginals.camera), len(error)))
+    pull = np.zeros((len(marginals.camera), 2, len(error)))
     order = np.argsort(term.frame, kind="stable")
     for rows in np.split(order, np.flatnonzero(np.diff(term.frame[order])) + 1):
-        by_camera = term.by_camera[:, :, rows].reshape(term.columns.shape[1], -1)
-        pull[term.columns[rows[0]]] += by_camera @ error[:, :, rows].reshape(len(error), -1).T
+        by_camera = term.by_camera[:, :, rows].reshape(-1, len(rows))
+        pull[term.columns[rows[0]]] += (by_camera @ error[:, rows].T).reshape(-1, 2, len(error))
     first = np.unique(term.point, return_index=True)[1]
-    by_point = [np.add.reduceat((row * error).sum(1), first, axis=1) for row in term.by_point]
-    step = np.einsum("nij,jqn->qni", marginals.point, np.stack(by_point))
+    by_point = [np.add.reduceat(row[:, None] * error, first, axis=2) for row in term.by_point]
+    step = np.einsum("nij,jdqn->dqni", marginals.point, np.stack(by_point)).reshape(2 * len(error), -1, 3)
+    reduced = pull.reshape(len(pull), -1)
     for cross, columns, points in marginals.blocks:
-        pull[columns] -= cross @ step[:, points].reshape(len(error), -1).T
-    return pull, np.asarray(step[:, :, 2].T)
+        reduced[columns] -= cross @ step[:, points].reshape(len(step), -1).T
+    return reduced, np.asarray(step[:, :, 2].T)
 
 
 def _ways(state: State) -> Array:
