@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -43,6 +44,7 @@ Array = NDArray[np.float64]
 logger = logging.getLogger(__name__)
 
 _LEAST_KEYPOINTS = 30
+_NAMED = 5  # photographs in a note, at most
 _WIDE_PARALLAX = 0.3  # of a map that determines the principal point of an unknown lens
 
 
@@ -329,8 +331,8 @@ class ImageSet:
                 frame.observability = replace(frame.observability, pixel_slide=slide)
 
     def _summary(self, result: Reconstruction, number: int, parts: list[SetMapper]) -> list[str]:
-        notes = [f"{photo.name}: {photo.left_out}." for photo in self.photos if photo.left_out]
-        notes += [f"{photo.name}: {photo.remark}." for photo in self.photos if photo.remark]
+        notes = _by_reason((photo.name, photo.left_out) for photo in self.photos)
+        notes += _by_reason((photo.name, photo.remark) for photo in self.photos)
         if len(parts) > 1:
             sizes = ", ".join(str(part.registered) for part in parts)
             notes.append(
@@ -348,8 +350,8 @@ class ImageSet:
             notes.append(f"{len(missing)} of {len(result.frames)} images could not be registered ({some}).")
         twins = [photo for photo in self.photos if photo.twin is not None and not photo.left_out]
         if twins:
-            some = ", ".join(f"{photo.name} (as {self.photos[photo.twin or 0].name})" for photo in twins[:5])
-            notes.append(f"Images that repeat another one have its pose: {some}{', …' if len(twins) > 5 else ''}.")
+            some = _some([f"{photo.name} (as {self.photos[photo.twin or 0].name})" for photo in twins])
+            notes.append(f"Images that repeat another one have its pose: {some}.")
         return self.notes + notes
 
     def _failure(self, message: str, images: list[MappedImage]) -> ReconstructionError:
@@ -360,6 +362,19 @@ class ImageSet:
                 status, reason = images[k].status, images[k].message
             frames.append(FrameResult(photo.index, photo.name, photo.timestamp, status, reason))
         return ReconstructionError(message, frames)
+
+
+def _by_reason(said: Iterable[tuple[str, str]]) -> list[str]:
+    """One note for each reason, of names and reasons; an empty reason is none."""
+    names: dict[str, list[str]] = {}
+    for name, reason in said:
+        if reason:
+            names.setdefault(reason, []).append(name)
+    return [f"{_some(those)}: {reason}." for reason, those in names.items()]
+
+
+def _some(names: list[str]) -> str:
+    return ", ".join(names[:_NAMED]) + (f", … ({len(names)} in all)" if len(names) > _NAMED else "")
 
 
 def _resized(camera: pycolmap.Camera, size: tuple[int, int]) -> pycolmap.Camera:

@@ -32,7 +32,7 @@ from factorsfm.export import export
 from factorsfm.frames.unordered import Unusable, looks_unordered, other_files, read_images
 from factorsfm.imagesets.cameras import find_cameras
 from factorsfm.imagesets.covisibility import common_tracks, longest_tracks, pyramid_score
-from factorsfm.imagesets.image_set import ImageSet
+from factorsfm.imagesets.image_set import ImageSet, _by_reason
 from factorsfm.imagesets.mapper import SetMapper, for_image_sets, map_parts
 from factorsfm.imagesets.photo_folder import Photo, PhotoFolder
 from factorsfm.polish.polish import Polished, polish
@@ -475,6 +475,11 @@ def test_format_and_focal_length_tell_cameras_apart() -> None:
     cameras = find_cameras(photos, Turned(), given)
     assert [p.camera for p in photos] == [0] * 8 + [1]
     assert cameras == [given, guess_camera(300, 300)]
+
+
+def test_what_is_said_of_many_photographs_is_said_once() -> None:
+    said = [("a", "blank"), *((f"p{k}", "reduced") for k in range(7)), ("b", ""), ("c", "blank")]
+    assert _by_reason(said) == ["a, c: blank.", "p0, p1, p2, p3, p4, … (7 in all): reduced."]
 
 
 def test_a_duplicate_that_lies_on_its_side(shot: RenderedShot, tmp_path: Path) -> None:
