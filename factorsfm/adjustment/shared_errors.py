@@ -47,7 +47,8 @@ _REACH = 1.0 / 48.0
 _FARTHEST = 0.065  # of the width: adjacent cells; cameras absorb much of what tracks farther apart share
 # Pixels by which a track is beside its place at the border of the image and at the end of the path, by each term of a
 # field that is quadratic in the place. Root mean squares on eight rendered, compressed shots and five rooms: 0.01 to
-# 0.07 of the linear terms, 0.02 to 0.08 of the quadratic ones. A constant field is a turn of each camera, as above.
+# 0.07 of the linear terms, 0.02 to 0.08 of the quadratic ones; some of it is in the neighbourhoods, too: with 0.04 the
+# errors of polished cameras are too small for their covariances. A constant field is a turn of each camera, as above.
 _BY_VIEW_PX = 0.025
 
 
@@ -203,8 +204,8 @@ def _by_view(adjustment: BundleAdjustment, marginals: Marginals, term: Term) -> 
     o = adjustment.observations
     x, y = (o.pixels / np.maximum(np.abs(o.pixels).max(0), 1e-9)).T
     fields = _BY_VIEW_PX / adjustment.observation_sigmas()[0] * np.stack([x, y, x * x, x * y, y * y])
-    pulled = [_pulled(fields * way[o.frame], marginals, term) for way in _ways(adjustment.state)]
-    pull, step = (np.concatenate(parts, 1) for parts in zip(*pulled, strict=True))
+    ways = _ways(adjustment.state)[:, o.frame]
+    pull, step = _pulled((ways[:, None] * fields).reshape(-1, len(x)), marginals, term)
     moved = marginals.camera @ pull
     return np.asarray(moved), _nearer(marginals, step, moved)
 
@@ -229,7 +230,8 @@ def _pulled(error: Array, marginals: Marginals, term: Term) -> tuple[Array, Arra
 
 
 def _ways(state: State) -> Array:
-    """(3, k) how far each camera is from the first one along the main directions of the path, of its longest way."""
+    """(d, k) how far each camera is from the first one along d <= 3 main directions of the path, as a share of the
+    longest way."""
     centers = -np.einsum("kji,kj->ki", state.rotation, state.translation)
     way = centers - centers[0]
     way = way / max(float(np.linalg.norm(way, axis=1).max()), 1e-12)
