@@ -35,6 +35,15 @@ def standing_out(adjustment: BundleAdjustment) -> NDArray[np.bool_]:
     return np.asarray(found & (found.sum() >= max(_LEAST, _LEAST_SHARE * len(found))))
 
 
+def far_off(adjustment: BundleAdjustment) -> NDArray[np.bool_]:
+    """(n,) which points cameras do not explain at all that are right for most of the others.
+
+    However many they are: with a third of the points on something that moves, the errors of all are widely spread.
+    """
+    size = log_errors(adjustment.observations, adjustment.reprojection_errors())
+    return np.asarray(size > np.log(_SIGMAS * adjustment.sigma))
+
+
 def moving_together(
     observations: Observations,
     errors: NDArray[np.float64],

@@ -16,7 +16,7 @@ from factorsfm.adjustment.state import State
 from factorsfm.mapping.group_readings import from_group
 from factorsfm.motion.at_rest import Rest
 from factorsfm.motion.burn_ins import contradicts, resting
-from factorsfm.motion.moving import SPOILT, standing_out
+from factorsfm.motion.moving import SPOILT, far_off, standing_out
 from factorsfm.motion.readings import Reading, cost, flat, most_likely, points_alone, solution_from
 from factorsfm.motion.turning import turning_groups
 from factorsfm.support.options import Options
@@ -113,7 +113,7 @@ def on_what_fits(start: State, few: Observations, options: Options) -> CameraSol
     """Converged from a start on the points that its cameras explain: what does not fit might lead away from it."""
     points = points_alone(start, few, 1.0, options.polish)
     sigma = coordinate_sigma(points.reprojection_errors())
-    moves = standing_out(BundleAdjustment(points.state, few, options.polish, ErrorModel(sigma)))
+    moves = far_off(BundleAdjustment(points.state, few, options.polish, ErrorModel(sigma)))
     others = np.nonzero(~moves)[0]
     found = _without_moving(solution_from(start.of(others), few.of(others), options.polish), options)
     return replace(found, kept=others[found.kept], moving=found.moving + int(moves.sum()))
