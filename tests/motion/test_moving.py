@@ -7,7 +7,7 @@ import pytest
 
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.problem import ErrorModel
-from factorsfm.motion.moving import as_exact, bounded_costs, largest_cost, moving_together, standing_out
+from factorsfm.motion.moving import as_exact, bounded_costs, far_off, largest_cost, moving_together, standing_out
 from factorsfm.polish.camera_starts import best_solution
 from factorsfm.support.options import Options, PolishOptions
 from factorsfm.tracks.flow import _moves_otherwise
@@ -113,6 +113,19 @@ def test_few_points_do_no_harm():
     problem, scene, _ = with_walker(0.05, count=8)
     solved = BundleAdjustment(problem.truth, problem.observations, PolishOptions(), ErrorModel(0.1))
     np.testing.assert_array_equal(np.flatnonzero(standing_out(solved)), np.arange(scene, scene + 8))
+
+
+def test_where_errors_are_widely_spread_all_that_is_far_off_is_found():
+    """Beside a walker with a third of the tracks, and tracks of the scene of all sorts."""
+    problem, scene, _ = with_walker(0.05, count=80)
+    o = problem.observations
+    rng = np.random.default_rng(2)
+    worse = np.where(np.arange(scene + 80) < scene // 3, 10.0 ** rng.uniform(-1.0, 0.0, scene + 80), 0.0)
+    seen = replace(o, pixels=o.pixels + worse[o.point, None] * rng.standard_normal(o.pixels.shape))
+    solved = BundleAdjustment(problem.truth, seen, PolishOptions(), ErrorModel(0.15))
+    assert standing_out(solved)[scene:].mean() < 0.5
+    assert far_off(solved)[scene:].mean() > 0.95
+    assert not far_off(solved)[:scene].any()
 
 
 def test_what_stands_out_costs_no_more_than_what_is_left_out():
