@@ -21,4 +21,4 @@ def test_errors_of_a_rendered_shot_are_those_of_its_covariances(motion, seed, le
     row = row_of(result, *pose_arrays(shot.cam_from_world), shot.depths[0])
     assert least < float(row["cameras, median"]) < most
     assert row["beyond 5, %"] == "0.0"
-    assert 0.3 < float(row["drift / slide, median"]) < 0.7  # 0.5
+    assert 0.4 < float(row["drift / slide, median"]) < 0.7  # 0.5
