@@ -37,6 +37,7 @@ from factorsfm.result.objects import add_objects, seen_again
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.streaming.stream import Stream
 from factorsfm.support.errors import InputError, ReconstructionError
+from factorsfm.support.first_few import first_few
 from factorsfm.support.options import LensFreedom, Options, ShutterUse
 from factorsfm.support.progress import Progress
 from factorsfm.support.status import FrameStatus
@@ -238,8 +239,7 @@ def _from_images(given: Inputs, progress: Progress | None) -> Reconstruction:
             control=given.control,
         )  # fmt: skip
         if isinstance(given.source, str | Path) and (others := other_files(Path(given.source))):
-            some = ", ".join(others[:5]) + (", …" if len(others) > 5 else "")
-            images.note(f"Not images, and ignored: {some}.")
+            images.note(f"Not images, and ignored: {first_few(others, 5)}.")
         for done, image in enumerate(read_images(given.source, given.frames)):
             if progress is not None:
                 progress("images", done, None)

@@ -18,6 +18,7 @@ from factorsfm.frames.cuts import CutDetector, by_shot
 from factorsfm.frames.fields import Fields
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.reading import read_frames
+from factorsfm.support.first_few import first_few
 
 Grey = NDArray[np.uint8]
 
@@ -82,7 +83,7 @@ class Edit:
         """The cuts between the shots in words, with what to do."""
         first, *others = self.starts
         count = f"{len(others)} cut{'s' if len(others) > 1 else ''}"
-        where = ", ".join(map(str, others[:5])) + (", …" if len(others) > 5 else "")
+        where = first_few(others, 5)
         return (
             f"{count}, before frame{'s' if len(others) > 1 else ''} {where}: these are {len(self.starts)} shots; "
             f"use batch, which solves each of them, or --frames for one, such as --frames {first}:{others[0]}"

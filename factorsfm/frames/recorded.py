@@ -11,6 +11,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from factorsfm.frames.timing import are_uneven, cadence, frame_interval, frame_times
+from factorsfm.support.first_few import first_few
 from factorsfm.support.picture_area import PictureArea
 
 _MOST_NOTED = 3  # repeated frames that are named
@@ -130,9 +131,8 @@ class RecordedFootage:
     def _repeats_said(self, rhythm: tuple[int, int] | None, interval: float) -> str:
         """Which frames repeat others."""
         if rhythm is None:
-            some = ", ".join(str(repeat.index) for repeat in self.repeats[:_MOST_NOTED])
-            more = ", …" if len(self.repeats) > _MOST_NOTED else ""
-            return f"Frames that repeat the one before, without a cadence: {len(self.repeats)} ({some}{more})."
+            some = first_few([repeat.index for repeat in self.repeats], _MOST_NOTED)
+            return f"Frames that repeat the one before, without a cadence: {len(self.repeats)} ({some})."
         period, new = rhythm
         rates = f": {new / interval / period:.4g} in {1 / interval:.4g} frames a second" if interval > 0 else ""
         if new == period - 1:

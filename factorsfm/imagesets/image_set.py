@@ -29,6 +29,7 @@ from factorsfm.priors.read_priors import read_depth, read_mask
 from factorsfm.result.assembly import assemble
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.support.errors import InputError, ReconstructionError
+from factorsfm.support.first_few import first_few
 from factorsfm.support.options import Options
 from factorsfm.support.progress import Progress
 from factorsfm.support.stages import StageSeconds
@@ -374,7 +375,7 @@ def _by_reason(said: Iterable[tuple[str, str]]) -> list[str]:
 
 
 def _some(names: list[str]) -> str:
-    return ", ".join(names[:_NAMED]) + (f", … ({len(names)} in all)" if len(names) > _NAMED else "")
+    return first_few(names, _NAMED) + (f" ({len(names)} in all)" if len(names) > _NAMED else "")
 
 
 def _resized(camera: pycolmap.Camera, size: tuple[int, int]) -> pycolmap.Camera:

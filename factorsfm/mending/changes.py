@@ -15,6 +15,7 @@ from factorsfm.control.known import Control
 from factorsfm.frames.ranges import checked_range, in_range, parse_range, range_text
 from factorsfm.polish.measured import MeasuredShot
 from factorsfm.support.errors import InputError
+from factorsfm.support.first_few import first_few
 from factorsfm.tracks.supervised import track_name
 
 Index = NDArray[np.int64]
@@ -144,7 +145,7 @@ class Changes:
         notes = []
         if self.tracks:
             names = measured.supervised.names_of(_ids_of(measured, self.tracks))
-            named = ", ".join(names[:_MOST_NAMED]) + (", …" if len(names) > _MOST_NAMED else "")
+            named = first_few(names, _MOST_NAMED)
             count = f"{len(names)} track{'s' * (len(names) != 1)}"
             notes.append(f"Solved again without {count}: {named}.")
         if self.regions:
