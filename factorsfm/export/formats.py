@@ -22,6 +22,7 @@ from factorsfm.export.tracks import (
     write_3de_tracks,
     write_after_effects_tracks,
     write_blender_tracks,
+    write_camera_tracker_tracks,
     write_csv_tracks,
     write_nuke_tracks,
 )
@@ -116,6 +117,11 @@ FORMATS = {
     ),
     "tracks-csv": Format("2-D tracks as a table", write_csv_tracks),
     "tracks-nuke": Format("2-D tracks as a Nuke Tracker", write_nuke_tracks, defaults=Defaults(first_frame=1001)),
+    "tracks-camera-tracker": Format(
+        "2-D tracks as text for Nuke's CameraTracker",
+        write_camera_tracker_tracks,
+        defaults=Defaults(first_frame=1001),
+    ),
     "tracks-3de": Format(
         "2-D tracks as text for 3DEqualizer", write_3de_tracks, defaults=Defaults(first_frame=1, numbered=False)
     ),

@@ -1,4 +1,4 @@
-"""The tracks as 2-D curves, for programs that match-move: plain text, Nuke, 3DEqualizer, Blender, After Effects."""
+"""The tracks as 2-D curves, for programs that match-move: a table, Nuke, 3DEqualizer, Blender, After Effects."""
 
 from __future__ import annotations
 
@@ -163,6 +163,20 @@ def _nuke_row(track: Track, height: int) -> str:
         f'{{ {enabled} "{name}" {{{curves[0]}}} {{{curves[1]}}} {still} {still} 1 0 0 {{curve x{first} 0}} 1 0 '
         f"{_PATTERN} {_SEARCH} {empty} }}"
     )
+
+
+def write_camera_tracker_tracks(shot: Shot, path: Path) -> None:
+    """Write the text in which Nuke's CameraTracker reads tracks, which is Shake's, for the footage as it was shot.
+
+    Pixels from the bottom left corner. The node asks for names of its own, so that those of the tracks are not in it.
+    """
+    lines, height = [], shot.lens.height
+    for k, track in enumerate(tracks_of(shot)):
+        lines += [f"TrackName autotrack{k}", "   Frame             X             Y   Correlation"]
+        for number, (x, y) in zip(track.numbers.tolist(), track.xy.tolist(), strict=True):
+            lines.append(f"{number:.2f} {x:.6f} {height - y:.6f} 1.000")
+        lines.append("")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def write_blender_tracks(shot: Shot, path: Path) -> None:

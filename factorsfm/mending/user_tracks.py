@@ -1,6 +1,6 @@
 """2-D tracks of the user: placed by hand, or made by another program, and read from its file.
 
-The files are those that `export` writes: the table (CSV), Nuke's Tracker and 3DEqualizer's text.
+The files are those that `export` writes: the table (CSV), Nuke's Tracker, CameraTracker's and 3DEqualizer's text.
 """
 
 from __future__ import annotations
@@ -105,13 +105,13 @@ def read_tracks(
     sigma: float = DEFAULT_SIGMA_PX,
     on: Plate | None = None,
 ) -> UserTracks:
-    """Read tracks from a file in one of the formats "tracks-csv", "tracks-nuke" and "tracks-3de" of `export`.
+    """Read tracks from a file in one of the formats of `export`, but for the scripts of Blender and After Effects.
 
     Args:
         first_number: with which the numbered sequence begins that is the source; None for all other sources.
         first_frame: number of the first frame of the source in the file; None is that of an export.
         sigma: see `UserTracks`.
-        on: see `UserTracks`; None is the plate of an export: "undistorted" for Nuke, else "footage".
+        on: see `UserTracks`; None is the plate of an export: "undistorted" for Nuke's Tracker, else "footage".
 
     Raises:
         InputError: the file cannot be read, or is none of these.
@@ -147,11 +147,13 @@ def _format_of(text: str, path: Path) -> tuple[str, Callable[[str], _Curves]]:
         return "tracks-nuke", nuke_tracks
     if re.match(r"\d+\s*\n", start):
         return "tracks-3de", _of_3de
+    if re.match(r"TrackName\s", start):
+        return "tracks-camera-tracker", _of_camera_tracker
     if "," in start.partition("\n")[0]:
         return "tracks-csv", _of_table
     raise InputError(
         f"tracks {path}: neither a table with track, frame, x and y, nor a script with Nuke's Tracker4, nor "
-        "3DEqualizer's text of 2-D tracks"
+        "CameraTracker's or 3DEqualizer's text of 2-D tracks"
     )
 
 
@@ -183,6 +185,23 @@ def _of_3de(text: str) -> _Curves:
                 _add(found[name], name, number, x, y, f'a line of track "{name}"')
     except StopIteration:
         raise ValueError("the text ends before its last track does") from None
+    return found
+
+
+def _of_camera_tracker(text: str) -> _Curves:
+    """Of each track a line with its name and one with headings; then frame, x, y and correlation of each place."""
+    found: _Curves = {}
+    name = ""
+    for k, line in enumerate(text.splitlines(), start=1):
+        words = line.split()
+        if words[:1] == ["TrackName"]:
+            name = line.strip().removeprefix("TrackName").strip()
+            if name in found:
+                raise ValueError(f'track "{name}" is there twice')
+            found[name] = {}
+        elif words and words[0] != "Frame":
+            number, x, y = (*words, "", "")[:3]
+            _add(found[name], name, re.sub(r"\.0*$", "", number), x, y, f"line {k}")
     return found
 
 

@@ -64,6 +64,19 @@ def test_3de(tmp_path: Path) -> None:
     compare(found, slice(2))
 
 
+def test_camera_tracker(tmp_path: Path) -> None:
+    found = {}
+    for k, block in enumerate(written(tmp_path, "tracks-camera-tracker").split("TrackName ")[1:]):
+        name, heading, *places = block.splitlines()
+        assert name == f"autotrack{k}"
+        assert heading.split() == ["Frame", "X", "Y", "Correlation"]
+        for place in filter(None, places):
+            number, x, y, correlation = map(float, place.split())
+            assert correlation == 1.0
+            found[build().track_names()[k], int(number)] = [x, HEIGHT - y]
+    compare(found, slice(2))
+
+
 def test_nuke_tracks_lie_on_the_undistorted_plate(tmp_path: Path) -> None:
     text = written(tmp_path, "tracks-nuke")
     assert text.count("{") == text.count("}")

@@ -35,14 +35,18 @@ from tests.exported_files import after_effects_tracks, nuke_curves, nuke_nodes
 from tests.rendered import FRAMES, rendered, with_fewer_tracks
 from tests.report.chromium import EXECUTABLE, MISSING, Chromium
 
+TRACK_FILES = ("tracks-csv", "tracks-nuke", "tracks-camera-tracker", "tracks-3de")
 
-@pytest.mark.parametrize("format", ["tracks-csv", "tracks-nuke", "tracks-3de"])
+
+@pytest.mark.parametrize("format", TRACK_FILES)
 @pytest.mark.parametrize("first_frame", [None, 77])
 def test_what_export_writes_is_read_back(format: str, first_frame: int | None, tmp_path: Path) -> None:
     result = build()
     export(result, tmp_path / "tracks", format=format, options=ExportOptions(first_frame=first_frame))
     read = read_tracks(tmp_path / "tracks", first_frame=first_frame)
     names = result.track_names()
+    if format == "tracks-camera-tracker":  # it has names of its own
+        names = [f"autotrack{k}" for k in range(len(names))]
     assert [track.name for track in read.tracks] == names
     registered = [frame.registered for frame in result.frames]
     for row, track in enumerate(read.tracks):
@@ -55,7 +59,7 @@ def test_what_export_writes_is_read_back(format: str, first_frame: int | None, t
 def test_a_numbered_sequence_keeps_its_numbers(tmp_path: Path) -> None:
     result = build()
     result.options["first_number"] = 10
-    for format in ("tracks-csv", "tracks-nuke", "tracks-3de"):
+    for format in TRACK_FILES:
         export(result, tmp_path / format, format=format)
         assert read_tracks(tmp_path / format, first_number=10).tracks[0].frames.tolist() == [10, 12, 14, 18, 20]
 
@@ -100,6 +104,10 @@ def test_a_script_of_nuke(tmp_path: Path) -> None:
         ("2\na\n0\n1\n1 2 3\n", "the text ends before its last track"),
         ("1\na\n0\n1\n1 2\n", "a line of track \"a\" is '1', '2', ''; a frame and two numbers are expected"),
         ("1\na\n0\nmany\n1 2 3\n", '"many" is no number of places of track "a"'),
+        ("TrackName a\n Frame X Y Correlation\n1.00 2 3 1\n1.00 2 3 1\n", 'track "a" has frame 1 twice'),
+        ("TrackName a\n1.00 2 3 1\nTrackName a\n2.00 2 3 1\n", 'track "a" is there twice'),
+        ("TrackName a\n1.50 2 3 1\n", "line 2 is '1.50'"),
+        ("TrackName a\n1.00 2\n", "line 2 is '1', '2', ''"),
         ("Tracker4 {\n tracks { { 1 2 3 }\n", "not closed"),
         ("Tracker4 {\n name a\n}\n", "no table of tracks"),
         (NUKE.replace("track_y track_y", "y y"), "no column track_y"),
