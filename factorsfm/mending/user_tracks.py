@@ -1,6 +1,7 @@
 """2-D tracks of the user: placed by hand, or made by another program, and read from its file.
 
-The files are those that `export` writes: the table (CSV), Nuke's Tracker, CameraTracker's and 3DEqualizer's text.
+The files are those that `export` writes, the table (CSV), Nuke's Tracker, CameraTracker's and 3DEqualizer's text, and
+the keyframes that After Effects copies.
 """
 
 from __future__ import annotations
@@ -105,7 +106,7 @@ def read_tracks(
     sigma: float = DEFAULT_SIGMA_PX,
     on: Plate | None = None,
 ) -> UserTracks:
-    """Read tracks from a file in one of the formats of `export`, but for the scripts of Blender and After Effects.
+    """Read tracks from a table, a Nuke script, the text of CameraTracker or 3DEqualizer, or After Effects' keyframes.
 
     Args:
         first_number: with which the numbered sequence begins that is the source; None for all other sources.
@@ -124,8 +125,9 @@ def read_tracks(
     except ValueError as error:
         raise InputError(f"tracks {path} are no text") from error
     format, read = _format_of(text, path)
+    from_top = format in ("tracks-csv", "tracks-after-effects")
     shift = first_frame_of(first_number, first_frame, FORMATS[format].defaults)
-    corner = np.array([0.5, 0.5 if format == "tracks-csv" else 0.0])  # y from the bottom stays as it is
+    corner = np.array([0.5, 0.5 if from_top else 0.0])  # y from the bottom stays as it is
     try:
         tracks = [
             UserTrack(
@@ -138,13 +140,15 @@ def read_tracks(
     except (ValueError, LookupError, OverflowError, RecursionError, InputError) as error:
         raise InputError(f"tracks {path}: {error}") from error
     plate: Plate = on or ("undistorted" if format == "tracks-nuke" else "footage")
-    return UserTracks(tracks, sigma, plate, format != "tracks-csv", f"tracks {path}")
+    return UserTracks(tracks, sigma, plate, not from_top, f"tracks {path}")
 
 
 def _format_of(text: str, path: Path) -> tuple[str, Callable[[str], _Curves]]:
     start = text.lstrip()
     if re.search(r"^\s*Tracker4\s*\{", text, re.MULTILINE):
         return "tracks-nuke", nuke_tracks
+    if start.startswith("Adobe After Effects"):
+        return "tracks-after-effects", _of_after_effects
     if re.match(r"\d+\s*\n", start):
         return "tracks-3de", _of_3de
     if re.match(r"TrackName\s", start):
@@ -153,7 +157,7 @@ def _format_of(text: str, path: Path) -> tuple[str, Callable[[str], _Curves]]:
         return "tracks-csv", _of_table
     raise InputError(
         f"tracks {path}: neither a table with track, frame, x and y, nor a script with Nuke's Tracker4, nor "
-        "CameraTracker's or 3DEqualizer's text of 2-D tracks"
+        "CameraTracker's or 3DEqualizer's text of 2-D tracks, nor After Effects' keyframes"
     )
 
 
@@ -202,6 +206,28 @@ def _of_camera_tracker(text: str) -> _Curves:
         elif words and words[0] != "Frame":
             number, x, y = (*words, "", "")[:3]
             _add(found[name], name, re.sub(r"\.0*$", "", number), x, y, f"line {k}")
+    return found
+
+
+def _of_after_effects(text: str) -> _Curves:
+    """Track points of trackers, and positions of layers; other properties are not read.
+
+    The names of the layers are not in the text: a position is called by its place in it.
+    """
+    found: _Curves = {}
+    places: dict[int, tuple[float, float]] | None = None
+    for k, line in enumerate(text.splitlines(), start=1):
+        words = line.strip().split("\t")
+        if line[:1].strip():  # a property, or the first or the last line
+            places, name = None, " ".join(words[1:-1])
+            if words[-1] == "Feature Center" or words == ["Transform", "Position"]:
+                name = name or f"position {len(found) + 1}"
+                if name in found:
+                    raise ValueError(f'track "{name}" is there twice')
+                places = found[name] = {}
+        elif places is not None and words[0] not in ("", "Frame"):
+            number, x, y = (*words, "", "")[:3]
+            _add(places, name, number, x, y, f"line {k}")
     return found
 
 

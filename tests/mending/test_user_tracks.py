@@ -64,6 +64,28 @@ def test_a_numbered_sequence_keeps_its_numbers(tmp_path: Path) -> None:
         assert read_tracks(tmp_path / format, first_number=10).tracks[0].frames.tolist() == [10, 12, 14, 18, 20]
 
 
+AFTER_EFFECTS = "\r\n".join(
+    [
+        "Adobe After Effects 8.0 Keyframe Data", "", "\tUnits Per Second\t25", "\tSource Width\t1920", "",
+        "Motion Trackers\tTracker #1\tTrack Point #2\tFeature Center", "\tFrame\tX pixels\tY pixels\t",
+        "\t3\t100.5\t20.25\t", "\t4\t101\t21\t", "",
+        "Motion Trackers\tTracker #1\tTrack Point #2\tConfidence", "\tFrame\tpercent\t", "\t3\t99\t", "",
+        "Transform\tScale", "\tFrame\tX percent\tY percent\t", "\t0\t100\t100\t", "",
+        "Transform\tPosition", "\tFrame\tX pixels\tY pixels\tZ pixels\t", "\t0\t7\t8\t0\t", "",
+        "End of Keyframe Data", "",
+    ]
+)  # fmt: skip
+
+
+def test_keyframes_that_after_effects_copies(tmp_path: Path) -> None:
+    (tmp_path / "ae.txt").write_bytes(AFTER_EFFECTS.encode())
+    point, layer = read_tracks(tmp_path / "ae.txt", first_frame=1).tracks
+    assert (point.name, layer.name) == ("Tracker #1 Track Point #2", "position 2")
+    assert (point.frames.tolist(), layer.frames.tolist()) == ([2, 3], [-1])
+    np.testing.assert_allclose(point.xy, [[100.0, 19.75], [100.5, 20.5]])
+    assert not read_tracks(tmp_path / "ae.txt").from_bottom
+
+
 NUKE = """
 Read { name Read1 }
 Tracker4 {
@@ -107,6 +129,8 @@ def test_a_script_of_nuke(tmp_path: Path) -> None:
         ("TrackName a\n Frame X Y Correlation\n1.00 2 3 1\n1.00 2 3 1\n", 'track "a" has frame 1 twice'),
         ("TrackName a\n1.00 2 3 1\nTrackName a\n2.00 2 3 1\n", 'track "a" is there twice'),
         ("TrackName a\n1.50 2 3 1\n", "line 2 is '1.50'"),
+        (AFTER_EFFECTS.replace("101\t21", "101"), "line 9 is '4', '101', ''"),
+        (AFTER_EFFECTS[:40], "there is no track"),
         ("TrackName a\n1.00 2\n", "line 2 is '1', '2', ''"),
         ("Tracker4 {\n tracks { { 1 2 3 }\n", "not closed"),
         ("Tracker4 {\n name a\n}\n", "no table of tracks"),
