@@ -9,13 +9,16 @@ Array = NDArray[np.float64]
 
 FIRST_SIGMA_PX = 0.25  # of a tracked point, until it is measured
 SMALLEST_SIGMA_PX = 0.03  # no track is better than this
-_RAYLEIGH_MEDIAN = 1.1774  # median of the norm of a 2-D error, in standard deviations
 _BLOCKS = (8, 5, 16)  # across, down, frames: in which errors may be correlated
 
 
-def typical_sigma(errors: Array) -> float:
-    """Standard deviation of a coordinate, from the lengths (n,) of 2-D errors with outliers."""
-    return float(np.median(errors)) / _RAYLEIGH_MEDIAN
+def typical_sigma(errors: Array, share: float = 0.5) -> float:
+    """Standard deviation of a coordinate, from the lengths (n,) of 2-D errors with outliers.
+
+    Args:
+        share: of the errors, the smallest ones, that are none of outliers.
+    """
+    return float(np.quantile(errors, share) / np.sqrt(-2.0 * np.log(1.0 - share)))
 
 
 def coordinate_sigma(errors: Array) -> float:

@@ -45,7 +45,10 @@ class Reading:
 
 
 def most_likely(readings: Sequence[Reading], observations: Observations) -> tuple[int, float]:
-    """The reading that costs least, where it refutes the first one; and its cost over that of the next best.
+    """The reading that costs least of those that refute the first one; and its cost over that of the next best scene.
+
+    The first one may explain everything half: then it costs less than any that explains one of two things and leaves
+    the other one out. It does not stand where each thing is explained far better by a reading of its own.
 
     Args:
         observations: of all points.
@@ -54,12 +57,26 @@ def most_likely(readings: Sequence[Reading], observations: Observations) -> tupl
         Its place, 0 where none refutes the first one.
     """
     sigma = min(reading.adjustment.sigma for reading in readings)
-    costs = np.array([cost(reading, observations, sigma) for reading in readings])
-    best = int(np.argmin(costs))
-    if best == 0 or not _refutes(readings[best], readings[0], observations):
+    weights = image_weights(observations)
+    table = np.array([_costs(reading, observations, sigma) for reading in readings])
+    costs = np.average(table, axis=1, weights=weights)
+    refuting = [k for k in range(1, len(readings)) if _refutes(readings[k], readings[0], observations)]
+    if not refuting:
         return 0, 0.0
-    logger.info("what turns together alone costs %.2f of what all do", costs[best] / costs[0])
-    return best, float(costs[best] / np.delete(costs, best).min())
+    best = min(refuting, key=lambda k: float(costs[k]))
+    apart = float(np.average(table[refuting].min(axis=0), weights=weights))
+    logger.info(
+        "one scene alone costs %.2f of what all do, each thing apart %.2f", *(np.r_[costs[best], apart] / costs[0])
+    )
+    if costs[best] > costs[0] and apart > _REFUTED * costs[0]:
+        return 0, 0.0
+    others = [k for k in range(1, len(readings)) if _another_scene(readings[k], readings[best])]
+    return best, float(costs[best] / costs[others].min(initial=np.inf))
+
+
+def _another_scene(reading: Reading, known: Reading) -> bool:
+    """Whether most of the points of a reading are not those of another one."""
+    return bool(np.isin(reading.kept, known.kept).mean() < 0.5)
 
 
 def _refutes(reading: Reading, known: Reading, few: Observations) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
-from factorsfm.adjustment.noise import coordinate_sigma, image_cells
+from factorsfm.adjustment.noise import SMALLEST_SIGMA_PX, image_cells, typical_sigma
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import ErrorModel
 from factorsfm.adjustment.state import State
@@ -31,6 +31,7 @@ _DOUBTFUL_INFLATION = 8.0  # see `error_inflation`; right solutions have 1 to 6,
 _CLEARLY = 0.9  # of the cost of the solution from the incremental map, below which another one is preferred
 _ROUGH = 1e-3  # relative decrease of the cost with which a try ends: the right one costs far less than the others
 _ROUNDS = 3  # in which what moves is left out
+_FITTING = 0.25  # of the observations: those that a start explains best, if most of the tracks may move by themselves
 _CORE_TRACKS = 400  # on which the cameras are solved first
 _CELLS, _CELL_TRACKS = (8, 5), 10  # across and down, and the tracks of each that take part at least
 
@@ -70,8 +71,8 @@ def best_solution(start: State, few: Observations, options: Options) -> CameraSo
     found = _without_moving(best, options)
     rough = replace(options, polish=replace(options.polish, tolerance=_ROUGH))
     if is_doubtful(found.adjustment, options):
-        logger.info("the solution does not fit (%.2f px), trying what turns together", found.adjustment.sigma)
-        found = _converged(_of_one_group(found, start, few, rough), found, options)
+        logger.info("the solution does not fit (%.2f px), trying what may be the scene", found.adjustment.sigma)
+        found = _converged(_of_one_scene(found, start, few, rough), found, options)
     if is_doubtful(found.adjustment, options):
         logger.info("the solution does not fit (%.2f px), trying other starts", found.adjustment.sigma)
         first = found
@@ -96,10 +97,11 @@ def is_doubtful(solved: BundleAdjustment, options: Options) -> bool:
     return solved.sigma > options.polish.doubtful_px or solved.error_inflation() > _DOUBTFUL_INFLATION
 
 
-def _of_one_group(known: CameraSolution, start: State, few: Observations, options: Options) -> CameraSolution:
-    """The solution from one of the groups that turn together, where it refutes the known one and explains more."""
-    groups = turning_groups(few, start.normalized(few), float(np.median(start.focal)))
+def _of_one_scene(known: CameraSolution, start: State, few: Observations, options: Options) -> CameraSolution:
+    """The solution on what the start explains, or on a group that turns together, where it refutes the known one."""
     solutions = [known]
+    if groups := turning_groups(few, start.normalized(few), float(np.median(start.focal))):
+        solutions.append(on_what_fits(start, few, options))
     for group in groups:
         reading = from_group(group, start, few, options.polish)
         found = _without_moving(reading.adjustment, options)
@@ -112,7 +114,7 @@ def _of_one_group(known: CameraSolution, start: State, few: Observations, option
 def on_what_fits(start: State, few: Observations, options: Options) -> CameraSolution:
     """Converged from a start on the points that its cameras explain: what does not fit might lead away from it."""
     points = points_alone(start, few, 1.0, options.polish)
-    sigma = coordinate_sigma(points.reprojection_errors())
+    sigma = max(typical_sigma(points.reprojection_errors(), _FITTING), SMALLEST_SIGMA_PX)
     moves = far_off(BundleAdjustment(points.state, few, options.polish, ErrorModel(sigma)))
     others = np.nonzero(~moves)[0]
     found = _without_moving(solution_from(start.of(others), few.of(others), options.polish), options)

@@ -92,7 +92,8 @@ def assemble(
     result.moving = _moving(polished, images, frames)
     has_depth = any(image.tracks.depth is not None for image in images)
     guessed = camera if polished.lens is None and not lens_given else None
-    result.doubts += result_doubts(polished)
+    moving = result.moving.share_of_image([frame.index for frame in result.registered]) if result.moving else 0.0
+    result.doubts += result_doubts(polished, moving)
     result.notes += result_notes(
         polished, result, guessed, depth_given=depth_kind is not None, has_depth=has_depth, interval=interval
     )

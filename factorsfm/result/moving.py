@@ -55,6 +55,11 @@ class Moving:
     track: Index
     xy: Array
 
+    def share_of_image(self, indices: Sequence[int]) -> float:
+        """Mean over frames with these indices."""
+        index = np.array(indices)
+        return sum(part.image * float(np.mean((index >= part.first) & (index <= part.last))) for part in self.stretches)
+
 
 def moving_in(images: Sequence[ImageTracks], indices: Sequence[int], judged: Index, moving: Index) -> Moving | None:
     """What moves by itself in the images of a shot, None where that is nowhere enough to tell.

@@ -23,14 +23,20 @@ from factorsfm.support.status import ShotKind
 _NOTED_SHARE = 0.5
 _NOTED_SLIDE_PX = 0.5
 _MOST_STRETCHES = 2  # sentences of each sort
-_AS_GOOD = 0.9  # cost over that of another reading, from which that is nearly as good
+_AS_GOOD = (
+    0.85  # cost over that of another reading, from which that is nearly as good; right solutions have 0.5 to 0.75
+)
 # Of the variance, since errors of neighbouring tracks are alike: right solutions have 1 to 7, wrong ones 13 to 80.
 _ALIKE = 10.0
-_MOST_OF_THE_IMAGE = 0.5  # resting, from which nobody doubts that the camera is fixed
+_MOST_OF_THE_IMAGE = 0.5  # at rest, nobody doubts that the camera is fixed; moving, it leaves little to rest on
 
 
-def result_doubts(polished: Polished) -> list[str]:
-    """Why the images leave open what the camera does, in sentences: another reading of the shot is nearly as good."""
+def result_doubts(polished: Polished, moving_share: float) -> list[str]:
+    """Why the images leave open what the camera does, in sentences: another reading of the shot is nearly as good.
+
+    Args:
+        moving_share: of the image, over all frames, what moves by itself.
+    """
     motion, rest, doubts = polished.motion, polished.rest, []
     if rest is not None and rest.fixed and rest.share < _MOST_OF_THE_IMAGE:
         doubts.append(
@@ -61,6 +67,11 @@ def result_doubts(polished: Polished) -> list[str]:
         doubts.append(
             "Two things fill the image and move against each other: which of them is the scene cannot be told, and the "
             "camera may be relative to the other one."
+        )
+    if moving_share > _MOST_OF_THE_IMAGE:
+        doubts.append(
+            f"{100 * moving_share:.0f} % of the image moves by itself: the cameras rest on the smaller part, whose "
+            "tracks the larger one drags along where it passes."
         )
     if polished.lens is not None and polished.lens.misfit_px:
         doubts.append(f"The tracks fit no lens: their typical error is {polished.lens.misfit_px:.2f} pixels.")

@@ -8,7 +8,7 @@ import pytest
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.problem import ErrorModel
 from factorsfm.motion.moving import as_exact, bounded_costs, far_off, largest_cost, moving_together, standing_out
-from factorsfm.polish.camera_starts import best_solution
+from factorsfm.polish.camera_starts import best_solution, on_what_fits
 from factorsfm.support.options import Options, PolishOptions
 from factorsfm.tracks.flow import _moves_otherwise
 from tests.estimation_problems import angles_between, centers, in_unit_of, make_problem, perturbed, with_points
@@ -58,17 +58,26 @@ def test_a_map_that_went_with_the_walker_is_given_up(parallax):
     assert 1e-5 < path_error(found.adjustment, problem, scene) < 0.002
 
 
-@pytest.mark.parametrize(("parallax", "count"), [(0.02, 70), (0.05, 90), (0.1, 70)])
+@pytest.mark.parametrize(("parallax", "count"), [(0.02, 70), (0.05, 90), (0.1, 70), (0.1, 150)])
 def test_a_good_map_is_not_led_away_by_many_tracks(parallax, count):
-    # Nearly half of the tracks are the walker's: solved with all of them, the cameras go with it, and nothing of it
+    # Half of the tracks are the walker's, or more: solved with all of them, the cameras go with it, and nothing of it
     # stands out any more.
     problem, scene, _ = with_walker(parallax, count)
     start = perturbed(problem.truth, angle_rad=1e-4, shift=1e-3, structure=0.02)
     found = best_solution(start, problem.observations, Options())
     np.testing.assert_array_equal(found.kept, np.arange(scene))
     assert found.moving == count
+    assert found.rival < 0.9  # two readings with the same scene are no rivals
     error_px = problem.focal * angles_between(found.adjustment.state.rotation, problem.truth.rotation)
     assert 0.01 < error_px.max() < 0.3
+
+
+def test_what_a_good_map_explains_is_found_beside_more_that_moves():
+    problem, scene, _ = with_walker(0.05, 160)
+    start = perturbed(problem.truth, angle_rad=1e-4, shift=1e-3, structure=0.02)
+    found = on_what_fits(start, problem.observations, Options())
+    np.testing.assert_array_equal(found.kept, np.arange(scene))
+    assert found.moving == 160
 
 
 def test_tracks_that_slide_are_kept():

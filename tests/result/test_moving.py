@@ -47,6 +47,7 @@ def test_shares_of_tracks_and_image_are_told_of_a_stretch():
     assert stretch.image == pytest.approx(0.25, abs=1e-12)
     np.testing.assert_array_equal(found.frame, np.repeat(np.arange(21, 36, 2), 50))
     assert found.xy[:, 0].max() < WIDTH / 4
+    assert found.share_of_image(range(1, 2 * FRAMES, 2)) == pytest.approx(0.25 * 8 / FRAMES, abs=1e-12)
     assert moving_note(found).startswith(
         "Something moves by itself and is left out: frames 21 to 35: 25 % of the tracks, 25 % of the image. "
     )
