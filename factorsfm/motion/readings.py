@@ -70,7 +70,7 @@ def most_likely(readings: Sequence[Reading], observations: Observations) -> tupl
     )
     if costs[best] > costs[0] and apart > _REFUTED * costs[0]:
         return 0, 0.0
-    others = [k for k in range(1, len(readings)) if _another_scene(readings[k], readings[best])]
+    others = [k for k in refuting if _another_scene(readings[k], readings[best])]
     return best, float(costs[best] / costs[others].min(initial=np.inf))
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from factorsfm.adjustment.noise import image_cells
 from factorsfm.adjustment.observations import Observations
+from factorsfm.motion.at_rest import image_weights
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -24,14 +25,14 @@ _STEPS = 20  # of the time, over each of which turns are compared
 _SEEDS = (4, 3)  # parts of the image, across and down, of which each begins a group
 _LEAST_TURNING = 4  # points of a step from which a turn is estimated
 _ROUNDS = 6  # of alternating turns and membership
-_LEAST, _LEAST_SHARE = 12, 0.08  # points of a group: fewer do no harm
+_LEAST, _LEAST_SHARE = 12, 0.08  # points of a group, and its share of the image: less does no harm
 _GROUPS = 3
 _FLOOR_PX = 1.0  # distance below which two turns are not told apart
 _SPREADS = 3.0  # typical distances of a group's points from its turn, within which a point belongs to it
 
 
 def turning_groups(observations: Observations, xy: Array, focal: float) -> list[Flags]:
-    """Groups of points, the largest part of what is left first; none where all turn together.
+    """Groups of points, that of the largest part of the image first; none where all turn together.
 
     Args:
         xy: (n, 2) normalised image coordinates of the observations; focal: pixels.
@@ -41,16 +42,21 @@ def turning_groups(observations: Observations, xy: Array, focal: float) -> list[
     """
     pairs = _pairs(observations, xy)
     seeds = image_cells(observations.pixels[observations.first], *_SEEDS)
-    count = int(observations.point[-1]) + 1
-    free = np.ones(count, bool)
+    weights = image_weights(observations)
+    share = np.asarray(np.bincount(observations.point, weights / weights.sum()), np.float64)
+    free = np.ones(len(share), bool)
     groups: list[Flags] = []
-    while len(groups) < _GROUPS and free.sum() >= max(_LEAST, _LEAST_SHARE * count):
-        group = _largest(pairs, seeds, free, focal)
-        if group.sum() < max(_LEAST, _LEAST_SHARE * count):
+    while len(groups) < _GROUPS and _is_large(free, share):
+        group = _largest(pairs, seeds, free, share, focal)
+        if not _is_large(group, share):
             break
         groups.append(group)
         free &= ~group
     return groups if len(groups) > 1 else []
+
+
+def _is_large(group: Flags, share: Array) -> bool:
+    return bool(group.sum() >= _LEAST and share[group].sum() >= _LEAST_SHARE)
 
 
 def _pairs(observations: Observations, xy: Array) -> list[Pair]:
@@ -68,10 +74,10 @@ def _pairs(observations: Observations, xy: Array) -> list[Pair]:
     return found
 
 
-def _largest(pairs: list[Pair], seeds: Index, free: Flags, focal: float) -> Flags:
-    """The largest group of the free points that turns with one of the seeds, as turns and membership settle."""
+def _largest(pairs: list[Pair], seeds: Index, free: Flags, share: Array, focal: float) -> Flags:
+    """The group of free points with the largest share that turns with one of the seeds, as turns and members settle."""
     grown = [_turning_with((seeds == seed) & free, pairs, free, focal) for seed in np.unique(seeds[free])]
-    group = max(grown, key=lambda members: int(members.sum()))
+    group = max(grown, key=lambda members: float(share[members].sum()))
     for _ in range(_ROUNDS):
         before, group = group, _turning_with(group, pairs, free, focal)
         if (group == before).all():

@@ -31,7 +31,7 @@ _DOUBTFUL_INFLATION = 8.0  # see `error_inflation`; right solutions have 1 to 6,
 _CLEARLY = 0.9  # of the cost of the solution from the incremental map, below which another one is preferred
 _ROUGH = 1e-3  # relative decrease of the cost with which a try ends: the right one costs far less than the others
 _ROUNDS = 3  # in which what moves is left out
-_FITTING = 0.25  # of the observations: those that a start explains best, if most of the tracks may move by themselves
+_FITTING = 0.25  # of the observations, that a good start explains even if most of the tracks move by themselves
 _CORE_TRACKS = 400  # on which the cameras are solved first
 _CELLS, _CELL_TRACKS = (8, 5), 10  # across and down, and the tracks of each that take part at least
 
@@ -61,15 +61,20 @@ def best_solution(start: State, few: Observations, options: Options) -> CameraSo
     single track may well persist for many frames: it slides along an edge.)
     """
     kept, best = np.arange(len(start.bearing)), solution_from(start, few, options.polish)
+    rough = replace(options, polish=replace(options.polish, tolerance=_ROUGH))
     static = resting(few)
     if static.any():
         others = np.nonzero(~static)[0]
         alone = solution_from(start.of(others), few.of(others), options.polish)
         if contradicts(best, alone, ~static):
+            if is_doubtful(alone, options):  # beside more that moves, what rests may be the scene
+                everything = CameraSolution(kept, best)
+                found = _converged(_of_one_scene(everything, start, few, rough), everything, options)
+                if found is not everything:
+                    return found
             logger.info("%d of %d points do not move in the image and are left out", static.sum(), len(static))
             kept, start, few, best = others, start.of(others), alone.observations, alone
     found = _without_moving(best, options)
-    rough = replace(options, polish=replace(options.polish, tolerance=_ROUGH))
     if is_doubtful(found.adjustment, options):
         logger.info("the solution does not fit (%.2f px), trying what may be the scene", found.adjustment.sigma)
         found = _converged(_of_one_scene(found, start, few, rough), found, options)
@@ -101,7 +106,7 @@ def _of_one_scene(known: CameraSolution, start: State, few: Observations, option
     """The solution on what the start explains, or on a group that turns together, where it refutes the known one."""
     solutions = [known]
     if groups := turning_groups(few, start.normalized(few), float(np.median(start.focal))):
-        solutions.append(on_what_fits(start, few, options))
+        solutions.append(on_what_fits(start, few, options, _FITTING))
     for group in groups:
         reading = from_group(group, start, few, options.polish)
         found = _without_moving(reading.adjustment, options)
@@ -111,10 +116,14 @@ def _of_one_scene(known: CameraSolution, start: State, few: Observations, option
     return replace(solutions[best], rival=rival) if best else known
 
 
-def on_what_fits(start: State, few: Observations, options: Options) -> CameraSolution:
-    """Converged from a start on the points that its cameras explain: what does not fit might lead away from it."""
+def on_what_fits(start: State, few: Observations, options: Options, share: float = 0.5) -> CameraSolution:
+    """Converged from a start on the points that its cameras explain: what does not fit might lead away from it.
+
+    Args:
+        share: of the observations, those that the start explains at least.
+    """
     points = points_alone(start, few, 1.0, options.polish)
-    sigma = max(typical_sigma(points.reprojection_errors(), _FITTING), SMALLEST_SIGMA_PX)
+    sigma = max(typical_sigma(points.reprojection_errors(), share), SMALLEST_SIGMA_PX)
     moves = far_off(BundleAdjustment(points.state, few, options.polish, ErrorModel(sigma)))
     others = np.nonzero(~moves)[0]
     found = _without_moving(solution_from(start.of(others), few.of(others), options.polish), options)

@@ -75,7 +75,7 @@ def test_a_good_map_is_not_led_away_by_many_tracks(parallax, count):
 def test_what_a_good_map_explains_is_found_beside_more_that_moves():
     problem, scene, _ = with_walker(0.05, 160)
     start = perturbed(problem.truth, angle_rad=1e-4, shift=1e-3, structure=0.02)
-    found = on_what_fits(start, problem.observations, Options())
+    found = on_what_fits(start, problem.observations, Options(), 0.25)
     np.testing.assert_array_equal(found.kept, np.arange(scene))
     assert found.moving == 160
 
