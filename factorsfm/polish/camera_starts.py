@@ -14,7 +14,7 @@ from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import ErrorModel
 from factorsfm.adjustment.state import State
 from factorsfm.mapping.group_readings import from_group
-from factorsfm.motion.at_rest import Rest
+from factorsfm.motion.at_rest import Rest, image_weights
 from factorsfm.motion.burn_ins import contradicts, resting
 from factorsfm.motion.moving import SPOILT, far_off, standing_out
 from factorsfm.motion.readings import Reading, cost, flat, most_likely, points_alone, solution_from
@@ -32,6 +32,7 @@ _CLEARLY = 0.9  # of the cost of the solution from the incremental map, below wh
 _ROUGH = 1e-3  # relative decrease of the cost with which a try ends: the right one costs far less than the others
 _ROUNDS = 3  # in which what moves is left out
 _FITTING = 0.25  # of the observations, that a good start explains even if most of the tracks move by themselves
+_MOST = 0.5  # of the image: where a solution leaves out more, it may be that of a thing before the scene
 _CORE_TRACKS = 400  # on which the cameras are solved first
 _CELLS, _CELL_TRACKS = (8, 5), 10  # across and down, and the tracks of each that take part at least
 
@@ -75,7 +76,7 @@ def best_solution(start: State, few: Observations, options: Options) -> CameraSo
             logger.info("%d of %d points do not move in the image and are left out", static.sum(), len(static))
             kept, start, few, best = others, start.of(others), alone.observations, alone
     found = _without_moving(best, options)
-    if is_doubtful(found.adjustment, options):
+    if is_doubtful(found.adjustment, options) or _share_left_out(found, few) > _MOST:
         logger.info("the solution does not fit (%.2f px), trying what may be the scene", found.adjustment.sigma)
         found = _converged(_of_one_scene(found, start, few, rough), found, options)
     if is_doubtful(found.adjustment, options):
@@ -87,6 +88,11 @@ def best_solution(start: State, few: Observations, options: Options) -> CameraSo
         mirrored = solution_from(reversed_scene(best.state), best.observations, rough.polish)
         found = _converged(_better(found, replace(found, adjustment=mirrored), few), first, options)
     return replace(found, kept=kept[found.kept])
+
+
+def _share_left_out(found: CameraSolution, few: Observations) -> float:
+    """Share of the image that a solution leaves out."""
+    return float(np.average(~np.isin(few.point, found.kept), weights=image_weights(few)))
 
 
 def _converged(found: CameraSolution, known: CameraSolution, options: Options) -> CameraSolution:
