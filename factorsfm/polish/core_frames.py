@@ -17,19 +17,22 @@ Index = NDArray[np.int64]
 
 # The time of a solution grows with the square of their number, and there are many: from several starts, through several
 # lenses, with and without translation. More frames hardly make lens and motion more certain, since the errors of tracks
-# persist from one to the next.
-_FRAMES = 60
+# persist from one to the next. Cameras alone, through a known lens, need still fewer: all are solved again at the end.
+_FRAMES, _FRAMES_ALONE = 60, 40
 _CLEARLY_FEWER = 1.25  # times as many frames as that: fewer save nothing, since all of them have to follow
 _IN_COMMON = 0.25  # of the tracks of a frame, which the one before it sees, too: a hundred and more
 
 
-def core_frames(observations: Observations, frames: int) -> Index:
+def core_frames(observations: Observations, frames: int, *, alone: bool) -> Index:
     """Rows of the fewest frames of a shot, evenly spread, each of which sees enough of what the one before does.
 
     Where the view is lost, all frames together do not see enough of what they did before either.
+
+    Args:
+        alone: whether neither lens nor shutter is estimated with them.
     """
     lost = _in_common(observations, np.arange(frames)) < _IN_COMMON
-    limit = _FRAMES
+    limit = _FRAMES_ALONE if alone else _FRAMES
     while _CLEARLY_FEWER * limit < frames:
         rows = np.linspace(0, frames - 1, limit).astype(int)
         enough = _in_common(observations, rows) >= _IN_COMMON

@@ -112,7 +112,8 @@ def _core(shot: Shot, frames: list[int], observations: Observations, tracks: Ind
     """Cameras, lens and shutter on the longest tracks; of a long shot on few of the frames first."""
     rows = np.arange(len(frames))
     if shot.in_time and options.lens != "zoom":  # between two frames, a zoom may change its speed
-        rows = core_frames(observations, len(frames))
+        alone = not options.estimates_lens and observations.sweep is None
+        rows = core_frames(observations, len(frames), alone=alone)
     if len(rows) < len(frames):
         few, points = seen_in(rows, observations)
         core = _solved_core(shot, [frames[row] for row in rows], few, tracks[points], options)

@@ -27,7 +27,7 @@ def tracks_of(length, frames):
 @pytest.mark.parametrize(("length", "expected"), [(100, 60), (6, 120), (3, 240), (2, 400)])
 def test_frames_are_few_as_long_as_they_see_the_same(length, expected):
     """Of 400 frames: every third and fourth needs tracks of six, which then have a third in common."""
-    rows = core_frames(tracks_of(length, 400), 400)
+    rows = core_frames(tracks_of(length, 400), 400, alone=False)
     assert len(rows) == expected
     assert rows[0] == 0
     assert rows[-1] == 399
@@ -41,12 +41,15 @@ def test_a_view_that_is_lost_asks_for_no_more_frames():
         np.r_[before.point, after.point + before.point.max() + 1],
         np.concatenate([before.pixels, after.pixels]),
     )
-    assert len(core_frames(both, 400)) == 60
+    assert len(core_frames(both, 400, alone=False)) == 60
 
 
-@pytest.mark.parametrize(("frames", "expected"), [(48, 48), (75, 75), (76, 60)])
-def test_a_short_shot_is_solved_on_all_frames(frames, expected):
-    rows = core_frames(tracks_of(12, frames), frames)
+@pytest.mark.parametrize(
+    ("frames", "alone", "expected"),
+    [(48, False, 48), (75, False, 75), (76, False, 60), (50, True, 50), (51, True, 40)],
+)
+def test_a_short_shot_is_solved_on_all_frames(frames, alone, expected):
+    rows = core_frames(tracks_of(12, frames), frames, alone=alone)
     assert len(rows) == expected
     assert rows[-1] == frames - 1
 
@@ -54,7 +57,7 @@ def test_a_short_shot_is_solved_on_all_frames(frames, expected):
 def polished(motion, lens, monkeypatch, few):
     problem = make_problem(motion, frames=FRAMES, points=200, parallax=0.1, noise_px=0.1)
     options = replace(Options.preset_named("geometry"), lens=lens)
-    monkeypatch.setattr(module, "_FRAMES", few)
+    monkeypatch.setattr(module, "_FRAMES_ALONE" if lens == "fixed" else "_FRAMES", few)
     points = np.arange(len(problem.truth.bearing)), problem.truth.points
     guess, shape = (1.0, None) if lens == "fixed" else (1.1, np.zeros(4))  # of the focal length
     focal = np.array([problem.focal * guess])
