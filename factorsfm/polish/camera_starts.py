@@ -61,33 +61,49 @@ def best_solution(start: State, few: Observations, options: Options) -> CameraSo
     incremental map may have been bent or depth-reversed beyond repair. Other starts are tried then. (The error of a
     single track may well persist for many frames: it slides along an edge.)
     """
-    kept, best = np.arange(len(start.bearing)), solution_from(start, few, options.polish)
-    rough = replace(options, polish=replace(options.polish, tolerance=_ROUGH))
+    everything = CameraSolution(np.arange(len(start.bearing)), solution_from(start, few, options.polish))
+    others = _without_resting(everything, start, few, options)
+    if others is None:
+        return _best(everything.adjustment, start, few, options)
+    if is_doubtful(others.adjustment, options):  # beside more that moves, what rests may be the scene
+        found = _of_one_scene(everything, start, few, options)
+        if found is not everything:
+            return found
+    kept, count = others.kept, len(start.bearing)
+    logger.info("%d of %d points do not move in the image and are left out", count - len(kept), count)
+    found = _best(others.adjustment, start.of(kept), others.adjustment.observations, options)
+    return replace(found, kept=kept[found.kept])
+
+
+def _without_resting(everything: Reading, start: State, few: Observations, options: Options) -> Reading | None:
+    """The solution without the points that rest in the image; None where these are none, or fit the others."""
     static = resting(few)
-    if static.any():
-        others = np.nonzero(~static)[0]
-        alone = solution_from(start.of(others), few.of(others), options.polish)
-        if contradicts(best, alone, ~static):
-            if is_doubtful(alone, options):  # beside more that moves, what rests may be the scene
-                everything = CameraSolution(kept, best)
-                found = _converged(_of_one_scene(everything, start, few, rough), everything, options)
-                if found is not everything:
-                    return found
-            logger.info("%d of %d points do not move in the image and are left out", static.sum(), len(static))
-            kept, start, few, best = others, start.of(others), alone.observations, alone
-    found = _without_moving(best, options)
+    if not static.any():
+        return None
+    others = np.nonzero(~static)[0]
+    alone = solution_from(start.of(others), few.of(others), options.polish)
+    return Reading(others, alone) if contradicts(everything.adjustment, alone, ~static) else None
+
+
+def _best(solved: BundleAdjustment, start: State, few: Observations, options: Options) -> CameraSolution:
+    """The best one of the solution from the start, one for each thing that may be the scene, and from other starts."""
+    found = _without_moving(solved, options)
     if is_doubtful(found.adjustment, options) or _share_left_out(found, few) > _MOST:
         logger.info("the solution does not fit (%.2f px), trying what may be the scene", found.adjustment.sigma)
-        found = _converged(_of_one_scene(found, start, few, rough), found, options)
-    if is_doubtful(found.adjustment, options):
-        logger.info("the solution does not fit (%.2f px), trying other starts", found.adjustment.sigma)
-        first = found
-        for other in (start, flat(start, few, rough.polish)):
-            found = _better(found, on_what_fits(other, few, rough), few)
-        best = found.adjustment
-        mirrored = solution_from(reversed_scene(best.state), best.observations, rough.polish)
-        found = _converged(_better(found, replace(found, adjustment=mirrored), few), first, options)
-    return replace(found, kept=kept[found.kept])
+        found = _of_one_scene(found, start, few, options)
+    if not is_doubtful(found.adjustment, options):
+        return found
+    logger.info("the solution does not fit (%.2f px), trying other starts", found.adjustment.sigma)
+    known, rough = found, _roughly(options)
+    for other in (start, flat(start, few, rough.polish)):
+        found = _better(found, on_what_fits(other, few, rough), few)
+    best = found.adjustment
+    mirrored = solution_from(reversed_scene(best.state), best.observations, rough.polish)
+    return _converged(_better(found, replace(found, adjustment=mirrored), few), known, options)
+
+
+def _roughly(options: Options) -> Options:
+    return replace(options, polish=replace(options.polish, tolerance=_ROUGH))
 
 
 def _share_left_out(found: CameraSolution, few: Observations) -> float:
@@ -110,16 +126,16 @@ def is_doubtful(solved: BundleAdjustment, options: Options) -> bool:
 
 def _of_one_scene(known: CameraSolution, start: State, few: Observations, options: Options) -> CameraSolution:
     """The solution on what the start explains, or on a group that turns together, where it refutes the known one."""
-    solutions = [known]
+    solutions, rough = [known], _roughly(options)
     if groups := turning_groups(few, start.normalized(few), float(np.median(start.focal))):
-        solutions.append(on_what_fits(start, few, options, _FITTING))
+        solutions.append(on_what_fits(start, few, rough, _FITTING))
     for group in groups:
-        reading = from_group(group, start, few, options.polish)
-        found = _without_moving(reading.adjustment, options)
+        reading = from_group(group, start, few, rough.polish)
+        found = _without_moving(reading.adjustment, rough)
         moving = found.moving + len(start.bearing) - len(reading.kept)
         solutions.append(replace(found, kept=reading.kept[found.kept], moving=moving))
     best, rival = most_likely(solutions, few)
-    return replace(solutions[best], rival=rival) if best else known
+    return _converged(replace(solutions[best], rival=rival), known, options) if best else known
 
 
 def on_what_fits(start: State, few: Observations, options: Options, share: float = 0.5) -> CameraSolution:
