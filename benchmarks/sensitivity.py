@@ -47,7 +47,7 @@ ROOMS = (
     "tracks", "priors", "adjustment", "graph", "motion", "mapping", "lens", "polish", "streaming", "support", "options",
 )  # fmt: skip
 FACTORS = (0.7, 1.4)
-MUCH = 3.0  # points of a column
+MUCH, LITTLE = 3.0, 0.5  # points of a column
 COLUMNS = (("ATE", 0.002), ("ATE", 0.02), ("T-RPE", 0.001), ("T-RPE", 0.005), ("R-RPE", 0.02), ("R-RPE", 0.1))
 
 Scores = dict[str, list[float]]
@@ -199,27 +199,31 @@ def _errors(name: str, data: Path, options: Options) -> dict[str, Any]:
 def report(records: dict[str, Scores], shots: tuple[str, ...]) -> str:
     """The constants that matter, the worst first, and how many do not."""
     base = records["unchanged"]
-    rows: list[tuple[float, list[object]]] = []
-    for key in sorted({key.rpartition(" ")[0] for key in records} - {""}):
-        changes = [
-            [float(np.min(np.subtract(records[f"{key} {f:g}"][name], base[name]))) for name in base]
-            for f in FACTORS
-            if f"{key} {f:g}" in records
-        ]
-        worst = min(map(min, changes))
-        rows.append((worst, [f"`{key}`", *(f"{live:+.1f} / {polished:+.1f}" for live, polished in changes)]))
-    rows.sort(key=lambda row: row[0])
-    matter = [row for worst, row in rows if worst < -MUCH]
+    losses: dict[str, list[dict[str, float]]] = {}
+    for key, found in records.items():
+        if key != "unchanged":
+            changes = {name: float(np.min(np.subtract(found[name], base[name]))) for name in found}
+            losses.setdefault(key.rpartition(" ")[0], []).append(changes)
+    fixed = sorted(name for name, changes in losses.items() if not all(changes))
+    worst = {name: min(min(c.values()) for c in losses[name]) for name in losses if name not in fixed}
+    rows = [
+        [f"`{name}`", *(f"{c['graph']:+.1f} / {c['polished']:+.1f}" for c in losses[name])]
+        for name in sorted(worst, key=lambda name: worst[name])
+        if worst[name] <= -LITTLE
+    ]
     return "\n\n".join(
         [
             "# Sensitivity",
             f"`python -m benchmarks.sensitivity --data FOLDER`. Machine: {machine()}. The first {FRAMES} frames of "
-            f"{', '.join(shots)}, TCMonoDepth at the keyframes, known lens. Of {len(rows)} constants that these shots "
-            f"meet, changed one at a time, {len(matter)} cost more than {MUCH:g} points in a pooled column.",
+            f"{', '.join(shots)}, TCMonoDepth at the keyframes, known lens. Of {len(worst)} constants in "
+            f"{', '.join(dict.fromkeys(name.partition('.')[0].partition(':')[0] for name in losses))} that these shots "
+            f"meet, changed one at a time, {sum(loss < -MUCH for loss in worst.values())} cost more than {MUCH:g} "
+            f"points in a pooled column, and {len(worst) - len(rows)} less than {LITTLE:g}.",
             "Unchanged: "
             + "; ".join(f"{name} {' / '.join(f'{value:.1f}' for value in found)}" for name, found in base.items())
             + ". The largest loss in any of these columns, of the live and of the polished poses:",
-            table(["constant", *(f"times {factor:g}: live / polished" for factor in FACTORS)], [r for _, r in rows]),
+            table(["constant", *(f"times {factor:g}: live / polished" for factor in FACTORS)], rows),
+            f"The program does not run with another: {', '.join(f'`{name}`' for name in fixed) or 'none'}.",
         ]
     )
 
@@ -254,7 +258,7 @@ def main() -> None:
                 if key == "unchanged":
                     raise
                 print(key, error, flush=True)
-                records[key] = {name: [0.0] * len(COLUMNS) for name in ("graph", "polished")}
+                records[key] = {}
             kept.write_text(json.dumps(records, indent=1))
             print(key, records[key], flush=True)
     (arguments.output / "SENSITIVITY.md").write_text(report(records, shots) + "\n")
