@@ -38,7 +38,8 @@ Index = NDArray[np.int64]
 
 logger = logging.getLogger(__name__)
 
-_LONGEST = 1.5  # frames: the sensor has to be done before the next one, and an estimate has an error
+_LONGEST = 1.0  # frames: the sensor has to be done before the next one ...
+_CLEARLY = 3.0  # ... and an estimate has an error, in standard deviations
 _LEAST_STEP = 0.03  # frames, of the first Newton step: a shorter readout does not matter
 _TURNING_GAIN = 10.0  # of translation, as in `Motion`, below which the camera may only turn
 _ROUGH = 1e-3  # relative decrease of the cost, with which few frames tell a clear translation from none
@@ -217,7 +218,7 @@ def _believed(solved: BundleAdjustment, guess: State) -> Shutter | None:
     readout = solved.state.lens[READOUT]
     deviation = float(np.nanmax(np.fmax(std, left_out)[-2:]))
     logger.info("readout %s within %.3f frames, %.0f squared deviations", readout, deviation, evidence)
-    if evidence < _LEAST_EVIDENCE or np.abs(readout).max() > _LONGEST:
+    if evidence < _LEAST_EVIDENCE or np.abs(readout).max() - _CLEARLY * deviation > _LONGEST:
         return None
     return Shutter(Lens(np.exp(guess.log_focal), np.r_[guess.lens[DISTORTION], readout]), deviation)
 

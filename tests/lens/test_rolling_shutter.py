@@ -204,6 +204,11 @@ def test_motion_is_seen_in_the_images_before_and_after():
     assert o.at(np.array([0, 2])).sweep is None
 
 
+def test_no_sensor_reads_longer_than_until_the_next_frame():
+    assert polished(rolling_problem("handheld", 0.99)).shutter is not None
+    assert polished(rolling_problem("handheld", 1.3)).shutter is None
+
+
 def test_errors_of_the_tracks_are_no_readout():
     """A truck does not show its readout: what the errors seem to say of one must not count."""
     for seed in range(2):
