@@ -23,9 +23,8 @@ from factorsfm.support.status import ShotKind
 _NOTED_SHARE = 0.5
 _NOTED_SLIDE_PX = 0.5
 _MOST_STRETCHES = 2  # sentences of each sort
-_AS_GOOD = (
-    0.85  # cost over that of another reading, from which that is nearly as good; right solutions have 0.5 to 0.75
-)
+# Cost over that of another reading, from which that is nearly as good; right solutions have 0.5 to 0.8.
+_AS_GOOD = 0.85
 # Of the variance, since errors of neighbouring tracks are alike: right solutions have 1 to 7, wrong ones 13 to 80.
 _ALIKE = 10.0
 _MOST_OF_THE_IMAGE = 0.5  # at rest, nobody doubts that the camera is fixed; moving, it leaves little to rest on
