@@ -21,9 +21,9 @@ def typical_sigma(errors: Array, share: float = 0.5) -> float:
     return float(np.quantile(errors, share) / np.sqrt(-2.0 * np.log(1.0 - share)))
 
 
-def coordinate_sigma(errors: Array) -> float:
+def coordinate_sigma(errors: Array, share: float = 0.5) -> float:
     """`typical_sigma`, but no better than tracks can be."""
-    return max(typical_sigma(errors), SMALLEST_SIGMA_PX)
+    return max(typical_sigma(errors, share), SMALLEST_SIGMA_PX)
 
 
 def block_inflation(residual: Array, frame: NDArray[np.int64], place: Array) -> float:

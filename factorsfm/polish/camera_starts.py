@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
-from factorsfm.adjustment.noise import SMALLEST_SIGMA_PX, image_cells, typical_sigma
+from factorsfm.adjustment.noise import coordinate_sigma, image_cells
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import ErrorModel
 from factorsfm.adjustment.state import State
@@ -145,7 +145,7 @@ def on_what_fits(start: State, few: Observations, options: Options, share: float
         share: of the observations, those that the start explains at least.
     """
     points = points_alone(start, few, 1.0, options.polish)
-    sigma = max(typical_sigma(points.reprojection_errors(), share), SMALLEST_SIGMA_PX)
+    sigma = coordinate_sigma(points.reprojection_errors(), share)
     moves = far_off(BundleAdjustment(points.state, few, options.polish, ErrorModel(sigma)))
     others = np.nonzero(~moves)[0]
     found = _without_moving(solution_from(start.of(others), few.of(others), options.polish), options)
