@@ -17,7 +17,7 @@ import json
 import multiprocessing
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, fields, replace
 from itertools import islice
@@ -196,7 +196,7 @@ def _errors(name: str, data: Path, options: Options) -> dict[str, Any]:
     return {kind: trajectory_errors(*pose_arrays(found), *true) for kind, found in poses.items()}
 
 
-def report(records: dict[str, Scores], shots: tuple[str, ...]) -> str:
+def report(records: dict[str, Scores], shots: tuple[str, ...], rooms: Sequence[str]) -> str:
     """The constants that matter, the worst first, and how many do not."""
     base = records["unchanged"]
     losses: dict[str, list[dict[str, float]]] = {}
@@ -214,11 +214,11 @@ def report(records: dict[str, Scores], shots: tuple[str, ...]) -> str:
     return "\n\n".join(
         [
             "# Sensitivity",
-            f"`python -m benchmarks.sensitivity --data FOLDER`. Machine: {machine()}. The first {FRAMES} frames of "
-            f"{', '.join(shots)}, TCMonoDepth at the keyframes, known lens. Of {len(worst)} constants in "
-            f"{', '.join(dict.fromkeys(name.partition('.')[0].partition(':')[0] for name in losses))} that these shots "
-            f"meet, changed one at a time, {sum(loss < -MUCH for loss in worst.values())} cost more than {MUCH:g} "
-            f"points in a pooled column, and {len(worst) - len(rows)} less than {LITTLE:g}.",
+            f"`python -m benchmarks.sensitivity --data FOLDER --rooms {' '.join(rooms)}`. Machine: {machine()}. The "
+            f"first {FRAMES} frames of {', '.join(shots)}, TCMonoDepth at the keyframes, known lens. Of {len(worst)} "
+            "constants in these rooms that the shots meet, changed one at a time, "
+            f"{sum(loss < -MUCH for loss in worst.values())} cost more than {MUCH:g} points in a pooled column, and "
+            f"{len(worst) - len(rows)} less than {LITTLE:g}.",
             "Unchanged: "
             + "; ".join(f"{name} {' / '.join(f'{value:.1f}' for value in found)}" for name, found in base.items())
             + ". The largest loss in any of these columns, of the live and of the polished poses:",
@@ -261,8 +261,9 @@ def main() -> None:
                 records[key] = {}
             kept.write_text(json.dumps(records, indent=1))
             print(key, records[key], flush=True)
-    (arguments.output / "SENSITIVITY.md").write_text(report(records, shots) + "\n")
-    print(report(records, shots))
+    text = report({key: records[key] for key in plan}, shots, arguments.rooms)
+    (arguments.output / "SENSITIVITY.md").write_text(text + "\n")
+    print(text)
 
 
 if __name__ == "__main__":
