@@ -148,9 +148,9 @@ class BundleAdjustment:
         return cost + sum(term.cost(state) for term in self._camera_terms)
 
     def _linearize(self) -> Normal:
-        s = self.state
-        terms = [self._tracks.linearized(s)] + ([] if self._depth is None else [self._depth.linearized(s)])
-        normal = self._elimination.normal_equations(terms, cameras=len(self._free) > 0)
+        s, cameras = self.state, len(self._free) > 0
+        terms = [term.linearized(s, cameras=cameras) for term in (self._tracks, self._depth) if term is not None]
+        normal = self._elimination.normal_equations(terms, cameras=cameras)
         normal.point[:, 2, 2] += 1.0 / self._point_sigma**2
         normal.point_gradient[:, 2] += (s.inverse_distance - self._anchor) / self._point_sigma**2
         for term in self._camera_terms:

@@ -29,28 +29,40 @@ class DepthTerm:
         """Robust cost."""
         return float(cauchy(self.residual(state)[:, None], self._kernel)[0].sum())
 
-    def linearized(self, state: State) -> Term:
-        """The weighted residuals and their derivatives at a state."""
-        p, columns = self._prior, Columns.of(state)
+    def linearized(self, state: State, *, cameras: bool = True) -> Term:
+        """The weighted residuals and their derivatives at a state; those by the cameras only where they are wanted."""
+        p = self._prior
         value, by_z, by_w, q, prediction = self._predicted(state)
         weight = np.sqrt(cauchy(value[:, None], self._kernel)[1])
-        by_z, by_w, unit = by_z * weight, by_w * weight, weight / p.sigma
-        along_z = np.zeros((len(q), 3))
-        along_z[:, 2] = by_z
+        by_z, by_w = by_z * weight, by_w * weight
         along = np.einsum("mi,mij->mj", state.rotation[p.frame, 2], tangent_basis(state.bearing)[p.point])
         by_point = np.column_stack([by_z[:, None] * along, by_z * state.translation[p.frame, 2] + by_w])
-        by_affine = np.stack([prediction * unit, unit], -1)
-        by_field = (state.scale[p.image] * unit)[:, None] * p.node_weights
-        by_camera = np.concatenate([by_pose(along_z, q, state.inverse_distance[p.point]), by_affine, by_field], 1)
-        affine = columns.affines.start + 2 * p.image[:, None] + np.arange(2)
+        by_camera, columns = np.empty((len(q), 0)), np.empty((len(q), 0), np.int64)
+        if cameras:
+            by_camera = self._by_camera(state, by_z, q, prediction, weight / p.sigma)
+            columns = self._columns(state)
         return Term(
             (value * weight)[None],
             np.ascontiguousarray(by_camera.T)[:, None],
-            np.concatenate([columns.pose(p.frame), affine, columns.field.start + p.nodes], 1),
+            columns,
             np.ascontiguousarray(by_point.T)[:, None],
             p.frame,
             p.point,
         )
+
+    def _by_camera(self, state: State, by_z: Array, q: Array, prediction: Array, unit: Array) -> Array:
+        """(m, c) derivatives of the weighted residuals by what `_columns` names; `unit`: (m,) weights of the values."""
+        p, along_z = self._prior, np.zeros((len(q), 3))
+        along_z[:, 2] = by_z
+        by_affine = np.stack([prediction * unit, unit], -1)
+        by_field = (state.scale[p.image] * unit)[:, None] * p.node_weights
+        return np.concatenate([by_pose(along_z, q, state.inverse_distance[p.point]), by_affine, by_field], 1)
+
+    def _columns(self, state: State) -> NDArray[np.int64]:
+        """(m, c) camera-side variables of each value: pose, affine and nodes of the field."""
+        p, columns = self._prior, Columns.of(state)
+        affine = columns.affines.start + 2 * p.image[:, None] + np.arange(2)
+        return np.concatenate([columns.pose(p.frame), affine, columns.field.start + p.nodes], 1)
 
     def _predicted(self, state: State) -> tuple[Array, Array, Array, Array, Array]:
         """Residuals, their derivatives by depth and inverse distance, points in the cameras, predictions."""

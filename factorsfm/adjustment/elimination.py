@@ -80,8 +80,8 @@ class Elimination:
         c, n = self._columns, self._points
         camera, gradient = np.zeros((c, c)), np.zeros(c)
         point, point_gradient = np.zeros((n, 3, 3)), np.zeros((n, 3))
-        for t, (groups, seen, first) in zip(terms, self._frame_groups(terms), strict=True):
-            for rows, columns, local in groups if cameras else []:
+        for t, (groups, seen, first) in zip(terms, self._frame_groups(terms, cameras), strict=True):
+            for rows, columns, local in groups:
                 dense = t.by_camera.take(rows, axis=2)
                 if local is not None:
                     entries, dense = dense, np.zeros((len(columns), *dense.shape[1:]))
@@ -89,7 +89,7 @@ class Elimination:
                 dense = dense.reshape(len(columns), dense.shape[1] * len(rows))
                 camera[np.ix_(columns, columns)] += dense @ dense.T
                 gradient[columns] += dense @ t.residual[:, rows].ravel()
-            if t.errors is not None and cameras:
+            if t.errors is not None and groups:
                 self._take_away_repeated(camera, t, t.errors, groups)
             by_point = t.decorrelated_by_point
             for i in range(3):
@@ -119,14 +119,14 @@ class Elimination:
             flat = total.reshape(len(occurring), -1)
             camera[np.ix_(occurring, occurring)] -= flat @ flat.T
 
-    def _frame_groups(self, terms: list[Term]) -> list[tuple[list[Group], Index, Index]]:
-        """For every term: its rows by frame; the points that occur, and the first row of each."""
+    def _frame_groups(self, terms: list[Term], cameras: bool) -> list[tuple[list[Group], Index, Index]]:
+        """For every term: its rows by frame, if wanted; the points that occur, and the first row of each."""
         if self._groups is None:
             self._groups = []
             for t in terms:
                 order = np.argsort(t.frame, kind="stable")
                 groups: list[Group] = []
-                for rows in np.split(order, np.nonzero(np.diff(t.frame[order]))[0] + 1):
+                for rows in np.split(order, np.nonzero(np.diff(t.frame[order]))[0] + 1) if cameras else []:
                     mine = t.columns[rows]
                     columns, (local,) = self._occurring(mine)
                     same = local.shape[1] == len(columns) and bool((local == np.arange(len(columns))).all())

@@ -65,16 +65,18 @@ class TrackTerm:
             return float(cauchy(residual, self._kernel)[0].sum())
         return self._errors.tracks.cost(residual)
 
-    def linearized(self, state: State) -> Term:
-        """The weighted residuals and their derivatives at a state."""
+    def linearized(self, state: State, *, cameras: bool = True) -> Term:
+        """The weighted residuals and their derivatives at a state; those by the cameras only where they are wanted."""
         o, errors = self._observations, self._errors.tracks
         known, self._known = self._known, None
         linear = known[1] if known is not None and known[0] is state else self._linear(state)
         residual, by_q, q, turn, shift = linear
         weight = np.sqrt(cauchy(residual.T, self._kernel)[1]) if errors is None else errors.root_weight
         by_q *= weight
-        by_camera = np.empty((self._columns.shape[1], 2, len(weight)))
-        by_camera[:6] = by_pose_rows(by_q, q, state.inverse_distance[o.point])
+        columns = self._columns if cameras else self._columns[:, :0]
+        by_camera = np.empty((columns.shape[1], 2, len(weight)))
+        if cameras:
+            by_camera[:6] = by_pose_rows(by_q, q, state.inverse_distance[o.point])
         if len(by_camera) > 6:
             self._add_optics(by_camera[6:], state, residual, q)
             by_camera[6:] *= weight
@@ -86,7 +88,7 @@ class TrackTerm:
         return Term(
             residual if errors is None else errors.decorrelated(residual),
             by_camera,
-            self._columns,
+            columns,
             by_point,
             o.frame,
             o.point,

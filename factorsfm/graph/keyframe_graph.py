@@ -62,6 +62,8 @@ class KeyframeGraph:
 
     def __init__(self) -> None:
         self._live = LiveIsam()
+        self._copy: LiveIsam | None = None  # on which the next update runs
+        self._replaced: tuple[LiveIsam | None, ...] = ()  # by the last update: GTSAM frees as slowly as it copies
         self._opens_lens_from = 0  # keyframes
 
     def update(
@@ -81,13 +83,14 @@ class KeyframeGraph:
         if not (window.frame == len(window.keyframes) - 1).any():
             return _rolled_back(window, "the keyframe observes no landmark")
         held = constants or gtsam.Values()
-        reason, trials = "", [self._live.copy()] if self._live.fits(window) else []
+        reason, trials = "", [self._trial()] if self._live.fits(window) else []
         # What is indeterminate from where the graph stands may not be so from the map, or with firmer landmarks.
         for live in (*trials, LiveIsam(), LiveIsam(landmark_sigma=_FIRM_LANDMARK_SIGMA)):
             try:
                 solved = live.update(window, iterations, added, held)
                 reason = _fault(solved, window.focal)
                 if not reason:
+                    self._replaced, self._copy = (self._live, self._copy), None
                     self._live, solved = self._with_open_lens(live, solved)
                     covariance = self._live.covariances(solved)
                     if not added.numbers:
@@ -99,6 +102,14 @@ class KeyframeGraph:
             except Exception as error:  # gtsam raises several types; any of them leaves the trial unusable
                 reason = f"the linear system of the update is indeterminate ({_first_line(error)})"
         return _rolled_back(window, reason)
+
+    def prepare(self) -> None:
+        """Do for the next update what takes time and can be done before, while nobody waits for one."""
+        self._replaced, self._copy = (), self._copy or self._live.copy()
+
+    def _trial(self) -> LiveIsam:
+        trial, self._copy = self._copy or self._live.copy(), None
+        return trial
 
     def _with_open_lens(self, live: LiveIsam, window: Window) -> tuple[LiveIsam, Window]:
         """The graph with the focal length among its variables, from when on the map determines it."""

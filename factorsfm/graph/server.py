@@ -73,6 +73,7 @@ def serve() -> None:
             outcome = _outcome(request, graph)
             answers.write(pickle.dumps(Answer(outcome, kept.taken()), pickle.HIGHEST_PROTOCOL))
             answers.flush()
+            graph.prepare()
     os._exit(0)  # at once: there is nothing to tidy up
 
 

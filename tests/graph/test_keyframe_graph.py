@@ -525,6 +525,24 @@ def test_a_keyframe_that_hardly_anything_holds_says_so():
         assert "indeterminate" in result.reason
 
 
+@pytest.mark.parametrize("spoil", [None, turned_away])
+def test_what_is_prepared_between_updates_changes_nothing(spoil):
+    """The copy is that of the graph as it is, also after an update that was rolled back or began another graph."""
+    shots = Shot("handheld", noise_px=0.1).run(2), Shot("handheld", noise_px=0.1).run(2)
+    for k, constant in ((2, 0), (3, 2), (4, 0), (5, 2)):
+        for shot in shots:
+            if spoil is not None:
+                sound, shot.images[k] = shot.images[k], replace(shot.images[k])
+                spoil(shot.images[k])
+                assert not shot.update(range(k + 1), constant=constant).committed
+                shot.images[k] = sound
+            shots[0].graph.prepare()
+            assert shot.update(range(k + 1), constant=constant).committed
+            shots[0].graph.prepare()
+        assert_equal(shots[0].solved, shots[1].solved)
+        assert shots[0].count() == shots[1].count()
+
+
 def test_a_bad_first_update_is_rolled_back():
     shot = Shot("truck")
     sound, shot.images[1] = shot.images[1], replace(shot.images[1])
