@@ -103,6 +103,10 @@ class KeyframeGraph:
                 reason = f"the linear system of the update is indeterminate ({_first_line(error)})"
         return _rolled_back(window, reason)
 
+    def start_anew(self) -> None:
+        """Begin another graph with the next update, from the values of its window."""
+        self._live, self._copy = LiveIsam(), None
+
     def prepare(self) -> None:
         """Do for the next update what takes time and can be done before, while nobody waits for one."""
         self._replaced, self._copy = (), self._copy or self._live.copy()

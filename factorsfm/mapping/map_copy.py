@@ -30,8 +30,9 @@ class MapUpdate:
         poses, affines, covariances: of the keyframes that moved, by position.
         focal: a better focal length (pixels), None where it stays as it is.
         burn_ins: tracks of what is laid over the images.
-        moving: how many tracks move by themselves, so that a young map begins again without them.
-        begins_again: whether a young map does, without those or without burn-ins: poses before are as wrong as it was.
+        moving: how many tracks move by themselves, so that the map begins again without them.
+        begins_again: whether it does, without those or, while it is young, without burn-ins: poses before are as wrong
+            as it was.
         mirrored: see `UpdateResult`.
         unit: how many times as long lengths are now, all others of the map included.
         added: the caller's factors as the next update needs them; offered: how many of those that waited were tried;

@@ -25,6 +25,7 @@ from factorsfm.mapping.map_copy import MapCopy, MapUpdate
 from factorsfm.mapping.map_registration import fits_pose
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.mapping.prior_check import inconsistency
+from factorsfm.mapping.second_look import scene_seen_later
 from factorsfm.mapping.young_map import YOUNG_KEYFRAMES, burn_ins_of, lifted_anew, resting_among, scene_alone
 from factorsfm.support.options import PolishOptions
 from factorsfm.support.similarity import covariance_in_unit
@@ -91,10 +92,10 @@ def _extended(copy: MapCopy, graph: KeyframeGraph) -> MapUpdate:
     ids, others = choose_landmarks(images, ids[fits], copy.added.tracks)
     others = np.union1d(others, np.setdiff1d(contradicting, laid_over))
     result = _solved(copy, graph, images, constant, ids, iterations)
-    burn_ins, removed, moving = burn_ins_of(result.window), ids[:0], 0
-    scene = np.setdiff1d(ids, burn_ins) if len(burn_ins) else scene_alone(copy, images, result.window, mapped)
-    begins_again = not np.array_equal(scene, ids)
-    if begins_again:
+    burn_ins, removed, moving = burn_ins_of(result.window, o.pixel_sigma), ids[:0], 0
+    scene = np.setdiff1d(ids, burn_ins) if len(burn_ins) else _scene(copy, graph, images, result.window, mapped)
+    bent = not np.array_equal(scene, ids)
+    if bent:
         tried = ids if len(burn_ins) else mapped
         moving = 0 if len(burn_ins) else len(mapped) - len(scene)
         ids = lifted_anew(copy, images, scene)
@@ -112,8 +113,18 @@ def _extended(copy: MapCopy, graph: KeyframeGraph) -> MapUpdate:
         removed=np.unique(removed),
         burn_ins=np.union1d(burn_ins, laid_over),
         moving=moving,
-        begins_again=begins_again and len(copy.keyframes) <= YOUNG_KEYFRAMES,
+        begins_again=bent and (moving > 0 or len(copy.keyframes) <= YOUNG_KEYFRAMES),
     )
+
+
+def _scene(copy: MapCopy, graph: KeyframeGraph, images: list[MappedImage], window: Window, mapped: Index) -> Index:
+    """The landmarks that are the scene: those of the window, unless something that moves by itself has bent the map."""
+    if len(copy.keyframes) <= YOUNG_KEYFRAMES:
+        return scene_alone(copy, images, window, mapped)
+    scene = scene_seen_later(copy, images, window, mapped)
+    if not np.array_equal(scene, window.ids):
+        graph.start_anew()
+    return scene
 
 
 def _solved(

@@ -19,10 +19,11 @@ from factorsfm.adjustment.state import State
 from factorsfm.graph.window import Window
 from factorsfm.mapping.group_readings import from_group
 from factorsfm.mapping.map_copy import MapCopy
-from factorsfm.mapping.mapped_images import MappedImage, state_of
+from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.mapping.registration import register_image
 from factorsfm.mapping.starts import lift
-from factorsfm.motion.burn_ins import contradicts, resting
+from factorsfm.motion.at_rest import image_weights
+from factorsfm.motion.burn_ins import CONTRADICTS, contradicts, resting
 from factorsfm.motion.readings import Reading, most_likely, solution_from
 from factorsfm.motion.turning import turning_groups
 from factorsfm.support.options import PolishOptions
@@ -33,8 +34,11 @@ YOUNG_KEYFRAMES = 6  # up to which a map is easily bent: by burn-ins, then it be
 _LEAST_KEYFRAMES = 3  # from which things that move may be told from the scene: two views show hardly more than a turn
 _TRIAL_ITERATIONS = 5  # that tell whether what rests is at odds with the others
 _FITS = 0.4  # times the assumed noise: the median error up to which nothing bends the map
+_FITS_IN_NOISE = 0.8  # the same of noisy footage, beside what may well be captions
+_MOST_BURNT_IN = 0.25  # of the image: captions, logos and time codes together cover less
+_FAR_BETTER = 0.5  # of the cost of what fits badly by itself, with what rests: below, that is what bends it
 _SOLVER = replace(PolishOptions(), tolerance=1e-3)
-_READING = replace(_SOLVER, iterations=20)
+READING = replace(_SOLVER, iterations=20)
 
 
 def scene_alone(copy: MapCopy, images: list[MappedImage], window: Window, ids: Index) -> Index:
@@ -43,29 +47,63 @@ def scene_alone(copy: MapCopy, images: list[MappedImage], window: Window, ids: I
     Args:
         window: as the graph has solved it; ids: all mapped tracks, those of the window among them.
     """
-    known = _adjustment(window)
     young = _LEAST_KEYFRAMES <= len(copy.keyframes) <= YOUNG_KEYFRAMES
-    if not young or np.median(known.reprojection_errors()) < _FITS * copy.options.pixel_sigma:
+    if not young or typical_error(window) < _FITS * copy.options.pixel_sigma:
         return window.ids
+    found = another_reading(copy, images, window, ids)
+    return window.ids if found is None else ids[found.kept]
+
+
+def another_reading(copy: MapCopy, images: list[MappedImage], window: Window, ids: Index) -> Reading | None:
+    """The most likely reading of the keyframes, None where it is that of the map.
+
+    Args:
+        window, ids: see `scene_alone`.
+    """
     seen = gather([image.tracks for image in images], ids, copy.focal)
-    state = state_of(images, copy.points.at(ids), copy.focal)
-    together = solution_from(known.state, known.observations, _READING)
-    readings = [Reading(np.searchsorted(ids, window.ids), together)]
+    points = copy.points.at(ids)
+    points[np.isin(ids, window.ids)] = window.points
+    distance = np.linalg.norm(points, axis=1)
+    inverse = 1.0 / distance
+    state = State(window.rotation, window.translation, points * inverse[:, None], inverse, np.log([copy.focal]))
+    readings = [Reading(np.arange(len(ids)), solution_from(state, seen, READING))]
     for group in turning_groups(seen, state.normalized(seen), copy.focal):
         if len(np.unique(seen.of(np.flatnonzero(group)).frame)) == len(images):
-            readings.append(from_group(group, state, seen, _READING))
-    return ids[readings[most_likely(readings, seen)[0]].kept]
+            readings.append(from_group(group, state, seen, READING))
+    best = most_likely(readings, seen)[0]
+    return readings[best] if best else None
+
+
+def typical_error(window: Window) -> float:
+    """Median of the reprojection errors, pixels."""
+    return float(np.median(window.reprojection()[0]))
 
 
 def resting_among(images: list[MappedImage], ids: Index, suspects: NDArray[np.bool_], focal: float) -> Index:
-    """Those of the suspected tracks (a part of `ids`) that rest in the image while the others move."""
+    """Those of the suspected tracks (a part of `ids`) that rest in the image while the others move.
+
+    None where they cover more of the image than captions do: they may be the scene behind something that moves.
+    """
     if not suspects.any():
         return ids[:0]
-    return ids[suspects & resting(gather([image.tracks for image in images], ids, focal))]
+    seen = gather([image.tracks for image in images], ids, focal)
+    found = suspects & resting(seen)
+    return ids[found] if _share_of_image(found, seen) < _MOST_BURNT_IN else ids[:0]
 
 
-def burn_ins_of(window: Window) -> Index:
-    """Tracks that rest in the image and contradict the others, when both go on from a solution with all of them."""
+def _share_of_image(points: NDArray[np.bool_], seen: Observations) -> float:
+    return float(np.average(points[seen.point], weights=image_weights(seen)))
+
+
+def burn_ins_of(window: Window, pixel_sigma: float) -> Index:
+    """Tracks that rest in the image and contradict the others, when both go on from a solution with all of them.
+
+    Where the others do not fit each other either, what rests may be the scene, and they what moves before it: it is
+    burnt in then only if they are explained far better without it.
+
+    Args:
+        pixel_sigma: standard deviation of a tracked point, pixels.
+    """
     together = _adjustment(window)
     rests = resting(together.observations)
     if not rests.any():
@@ -80,7 +118,10 @@ def burn_ins_of(window: Window) -> Index:
     )
     for adjustment in (together, alone):
         adjustment.solve(_TRIAL_ITERATIONS)
-    return window.ids[rests] if contradicts(together, alone, ~rests) else np.zeros(0, np.int64)
+    fit = _FITS if _share_of_image(rests, together.observations) > _MOST_BURNT_IN else _FITS_IN_NOISE
+    fits = np.median(alone.reprojection_errors()) < fit * pixel_sigma
+    burnt_in = contradicts(together, alone, ~rests, CONTRADICTS if fits else _FAR_BETTER)
+    return window.ids[rests] if burnt_in else np.zeros(0, np.int64)
 
 
 def lifted_anew(copy: MapCopy, window: list[MappedImage], ids: Index) -> Index:

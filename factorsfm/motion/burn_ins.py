@@ -19,7 +19,7 @@ from factorsfm.adjustment.residuals import cauchy
 _MOVED_PX = 2.0  # typical displacement of the others, from which something may be said to rest ...
 _RESTS = 0.15  # ... and the share of it by which that may seem to move: its surroundings are in its window
 _LEAST, _LEAST_SHARE = 8, 0.08  # points: fewer do no harm
-_CONTRADICTS = 0.95  # of the cost of the others' observations, if they are explained alone
+CONTRADICTS = 0.95  # of the cost of the others' observations, if they are explained alone
 
 
 def resting(observations: Observations) -> NDArray[np.bool_]:
@@ -51,7 +51,7 @@ def resting(observations: Observations) -> NDArray[np.bool_]:
 
 
 def contradicts(
-    together: BundleAdjustment, alone: BundleAdjustment, kept: NDArray[np.bool_], below: float = _CONTRADICTS
+    together: BundleAdjustment, alone: BundleAdjustment, kept: NDArray[np.bool_], below: float = CONTRADICTS
 ) -> bool:
     """Whether what is suspected spoils the solution of the others.
 

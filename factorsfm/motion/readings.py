@@ -21,6 +21,7 @@ from factorsfm.adjustment.state import State
 from factorsfm.motion.at_rest import image_weights
 from factorsfm.motion.moving import bounded_costs, largest_cost
 from factorsfm.support.options import PolishOptions
+from factorsfm.support.rotations import exponential
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -147,3 +148,16 @@ def in_front(part: State) -> State:
     if float(np.median(part.inverse_distance)) >= 0.0:
         return part
     return replace(part, translation=-part.translation, inverse_distance=-part.inverse_distance)
+
+
+def reversed_scene(part: State) -> State:
+    """Near and far exchanged and the motion reversed: in a narrow view the images are almost the same.
+
+    Each camera also turns, by twice the angle under which its way is seen from the middle of the scene: what was seen
+    there stays where it was. Without that, the way back to the first scene is shorter than that to its reversal.
+    """
+    center = float(np.median(part.inverse_distance))
+    inverse = np.clip(2.0 * center - part.inverse_distance, 0.05 * center, 4.0 * center)
+    x, y, z = 2.0 * center * part.translation.T
+    turn = exponential(np.stack([-y, x, np.zeros_like(x)], 1) / np.maximum(1.0 + z, 0.5)[:, None])
+    return replace(part, rotation=turn @ part.rotation, translation=-part.translation, inverse_distance=inverse)

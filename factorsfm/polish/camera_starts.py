@@ -17,10 +17,9 @@ from factorsfm.mapping.group_readings import from_group
 from factorsfm.motion.at_rest import Rest, image_weights
 from factorsfm.motion.burn_ins import contradicts, resting
 from factorsfm.motion.moving import SPOILT, far_off, standing_out
-from factorsfm.motion.readings import Reading, cost, flat, most_likely, points_alone, solution_from
+from factorsfm.motion.readings import Reading, cost, flat, most_likely, points_alone, reversed_scene, solution_from
 from factorsfm.motion.turning import turning_groups
 from factorsfm.support.options import Options
-from factorsfm.support.rotations import exponential
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -177,19 +176,6 @@ def _better(known: CameraSolution, other: CameraSolution, few: Observations) -> 
     sigma = min(known.adjustment.sigma, other.adjustment.sigma)
     known_cost, other_cost = (cost(solution, few, sigma) for solution in (known, other))
     return other if other_cost < _CLEARLY * known_cost else known
-
-
-def reversed_scene(part: State) -> State:
-    """Near and far exchanged and the motion reversed: in a narrow view the images are almost the same.
-
-    Each camera also turns, by twice the angle under which its way is seen from the middle of the scene: what was seen
-    there stays where it was. Without that, the way back to the first scene is shorter than that to its reversal.
-    """
-    center = float(np.median(part.inverse_distance))
-    inverse = np.clip(2.0 * center - part.inverse_distance, 0.05 * center, 4.0 * center)
-    x, y, z = 2.0 * center * part.translation.T
-    turn = exponential(np.stack([-y, x, np.zeros_like(x)], 1) / np.maximum(1.0 + z, 0.5)[:, None])
-    return replace(part, rotation=turn @ part.rotation, translation=-part.translation, inverse_distance=inverse)
 
 
 def core_tracks(observations: Observations, frames: int) -> Index:

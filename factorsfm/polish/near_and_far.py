@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.prior_term import LEAST_CORRELATION, WeighedPrior, weigh_prior
 from factorsfm.adjustment.problem import ErrorModel
-from factorsfm.motion.readings import solution_from
-from factorsfm.polish.camera_starts import Index, reversed_scene
+from factorsfm.motion.readings import reversed_scene, solution_from
+from factorsfm.polish.camera_starts import Index
 from factorsfm.support.options import Options
 from factorsfm.tracks.image_tracks import ImageTracks
 

@@ -1,5 +1,7 @@
 """Captions and logos that stay in the image: left out where they contradict the scene, and only there."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,7 @@ from factorsfm.mapping import graph_window, map_update
 from factorsfm.mapping.map_copy import MapCopy
 from factorsfm.mapping.map_update import update_map
 from factorsfm.mapping.point_map import PointMap
+from factorsfm.mapping.young_map import resting_among
 from factorsfm.motion.burn_ins import resting
 from factorsfm.polish.camera_starts import best_solution
 from factorsfm.support.options import MapperOptions, Options, TrackerOptions
@@ -17,14 +20,23 @@ from tests.estimation_problems import angles_between, make_problem, mapped_image
 CAPTIONS = 40
 
 
-def captioned(motion, parallax, count=CAPTIONS):
-    """A problem whose last `count` points rest in the image; how many of its points do not."""
-    problem = make_problem(motion, frames=16, points=160, parallax=parallax, noise_px=0.1)
-    at = np.random.default_rng(0).uniform([-0.4, -0.25], [0.4, 0.25], (count, 2))
+def captioned(motion, parallax, count=CAPTIONS, noise_px=0.1, left=-0.4):
+    """A problem whose last `count` points rest in the image, right of a line; how many of its points do not."""
+    problem = make_problem(motion, frames=16, points=160, parallax=parallax, noise_px=noise_px)
+    at = np.random.default_rng(0).uniform([left, -0.25], [0.4, 0.25], (count, 2))
     rays = np.column_stack([at, np.ones(count)])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     pixels = problem.focal * np.repeat(at[:, None], problem.frames, 1)
     return with_points(problem, rays, pixels), len(problem.points)
+
+
+def map_with(problem, scene, cameras, keyframes):
+    """A map of some of the frames, the captions among its points, far away."""
+    images = mapped_images(problem, cameras)
+    points = PointMap()
+    far = np.where(np.arange(len(problem.points)) < scene, 1.0, 30.0)[:, None]
+    points.set(np.arange(len(problem.points)), problem.points * far)
+    return MapCopy([images[k] for k in keyframes], points, MapperOptions(), problem.focal)
 
 
 @pytest.mark.parametrize(("count", "found"), [(CAPTIONS, CAPTIONS), (5, 0)])
@@ -63,12 +75,8 @@ def test_what_may_be_far_away_is_kept(motion, parallax):
 @pytest.mark.parametrize(("motion", "found"), [("handheld", True), ("truck", False)])
 def test_the_map_takes_captions_out_at_once(motion, found):
     problem, scene = captioned(motion, 0.05)
-    images = mapped_images(problem, perturbed(problem.truth, angle_rad=0.001, shift=0.003, structure=0.03))
-    points = PointMap()
-    far = np.where(np.arange(len(problem.points)) < scene, 1.0, 30.0)[:, None]
-    points.set(np.arange(len(problem.points)), problem.points * far)
-    keyframes = [images[k] for k in (0, 3, 6, 9)]
-    update = update_map(MapCopy(keyframes, points, MapperOptions(), problem.focal), KeyframeGraph())
+    near = perturbed(problem.truth, angle_rad=0.001, shift=0.003, structure=0.03)
+    update = update_map(map_with(problem, scene, near, (0, 3, 6, 9)), KeyframeGraph())
     assert update.committed
     captions = np.arange(scene, len(problem.points)) if found else np.zeros(0, np.int64)
     np.testing.assert_array_equal(update.burn_ins, captions)
@@ -76,18 +84,45 @@ def test_the_map_takes_captions_out_at_once(motion, found):
     assert not np.isin(captions, update.ids).any()
 
 
+def captions_beside(left, noise_px=0.1):
+    """60 points that rest right of a line, and a scene that is seen left of it only."""
+    problem, scene = captioned("handheld", 0.05, 60, noise_px, left)
+    o = problem.observations
+    kept = np.flatnonzero((o.pixels[o.first, 0] < problem.focal * left) | (np.arange(len(problem.points)) >= scene))
+    return replace(problem, truth=problem.truth.of(kept), points=problem.points[kept], observations=o.of(kept))
+
+
+@pytest.mark.parametrize(
+    ("left", "noise_px", "found"), [(0.3, 0.2, True), (0.1, 0.1, True), (0.1, 0.2, False), (0.1, 0.4, True)]
+)
+def test_what_rests_on_much_of_the_image_bends_the_map_only_if_the_rest_fits_or_fits_far_better(
+    left, noise_px, found, monkeypatch
+):
+    """0.7, 0.6, 0.8 and 0.3 of the cost, of which the last three are on more of the image than captions are."""
+    monkeypatch.setattr(map_update, "fits_pose", lambda image, ids, *_: np.ones(len(ids), bool))  # a map that they bent
+    problem = captions_beside(left, noise_px)
+    copy = map_with(problem, len(problem.points) - 60, problem.truth, (0, 3, 6, 9))
+    assert len(update_map(copy, KeyframeGraph()).burn_ins) == (60 if found else 0)
+
+
+@pytest.mark.parametrize(("left", "found"), [(0.3, 60), (0.1, 0)])
+def test_what_contradicts_and_rests_on_much_of_the_image_may_be_the_scene(left, found):
+    problem = captions_beside(left)
+    ids = np.arange(len(problem.points))
+    suspects = ids >= len(ids) - 60
+    assert len(resting_among(mapped_images(problem, problem.truth), ids, suspects, problem.focal)) == found
+
+
 def test_captions_take_nothing_else_out_of_an_old_map(monkeypatch):
     """Points that the graph has no room for stay in the map."""
     problem, scene = captioned("handheld", 0.05)
-    images = mapped_images(problem, perturbed(problem.truth, angle_rad=0.001, shift=0.003, structure=0.03))[:8]
+    near = perturbed(problem.truth, angle_rad=0.001, shift=0.003, structure=0.03)
+    copy = map_with(problem, scene, near, range(8))
     outside = np.arange(30)  # the newest keyframe does not see them
-    images[-1].forget_tracks(outside)
+    copy.newest.forget_tracks(outside)
     monkeypatch.setattr(graph_window, "_MOST_LANDMARKS", len(problem.points) - len(outside))
     monkeypatch.setattr(map_update, "fits_pose", lambda image, ids, *_: np.ones(len(ids), bool))  # a map that they bent
-    points = PointMap()
-    far = np.where(np.arange(len(problem.points)) < scene, 1.0, 30.0)[:, None]
-    points.set(np.arange(len(problem.points)), problem.points * far)
-    update = update_map(MapCopy(images, points, MapperOptions(), problem.focal), KeyframeGraph())
+    update = update_map(copy, KeyframeGraph())
     assert update.committed
     np.testing.assert_array_equal(update.burn_ins, np.arange(scene, len(problem.points)))
     np.testing.assert_array_equal(update.removed, update.burn_ins)

@@ -7,8 +7,7 @@ import pytest
 
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.problem import ErrorModel
-from factorsfm.motion.readings import solution_from
-from factorsfm.polish.camera_starts import reversed_scene
+from factorsfm.motion.readings import reversed_scene, solution_from
 from factorsfm.polish.near_and_far import near_and_far
 from factorsfm.support.options import Options, PolishOptions
 from tests.estimation_problems import make_problem, mapped_images
