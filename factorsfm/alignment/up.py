@@ -1,4 +1,4 @@
-"""Up, from all that tells it: an IMU, edges in the images, the plane of the ground."""
+"""Up, from all that tells it: an IMU, photographs, edges in the images, the plane of the ground."""
 
 from __future__ import annotations
 
@@ -8,14 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.alignment.edges import FRAMES, find_edges, up_from_edges
+from factorsfm.alignment.gravity import up_from_photos
 from factorsfm.alignment.planes import find_plane
 from factorsfm.export.footage import frames_of
 from factorsfm.export.shot import Shot
-from factorsfm.result.reconstruction import Reconstruction
+from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.support.errors import InputError
 
 Array = NDArray[np.float64]
 
+_PHOTOS = 24  # that are asked
 _GROUND_DEGREES = 1.5  # by which the plane that points lie on is off level: floors slope, and points stand on them
 _AGREE = 3.0  # standard deviations within which two sources say the same
 
@@ -26,7 +28,7 @@ class Up:
 
     Attributes:
         direction: (3,) unit vector; std: standard deviation about its worst axis, degrees.
-        sources: "imu", "edges", "ground": those that agree, the surest first.
+        sources: "imu", "photos", "edges", "ground": those that agree, the surest first.
     """
 
     direction: Array
@@ -46,7 +48,7 @@ def find_up(result: Reconstruction, shot: Shot | None) -> Up | None:
     """Up as far as anything tells it: the surest source, and those that agree with it by their weights.
 
     Args:
-        shot: with the footage in which edges are sought; None does without.
+        shot: with the footage in which edges are sought, and which may be photographs that say it; None does without.
 
     Raises:
         InputError: the footage does not go with the result.
@@ -54,8 +56,10 @@ def find_up(result: Reconstruction, shot: Shot | None) -> Up | None:
     known: list[tuple[float, str, Array]] = []
     if result.imu is not None:
         known.append((result.imu.up_std, "imu", np.array(result.imu.up)))
-    if shot is not None and (edges := _from_edges(shot)) is not None:
-        known.append((edges[1], "edges", edges[0]))
+    if shot is not None:
+        for name, found in (("photos", _from_photos(shot)), ("edges", _from_edges(shot))):
+            if found is not None:
+                known.append((found[1], name, found[0]))
     try:
         plane = find_plane(result)
     except InputError:  # too few points for any plane
@@ -76,9 +80,25 @@ def find_up(result: Reconstruction, shot: Shot | None) -> Up | None:
     return Up(mean / np.linalg.norm(mean), float(weights.sum() ** -0.5), [name for _, name, _ in agreeing])
 
 
-def _from_edges(shot: Shot) -> tuple[Array, float] | None:
+def _spread(shot: Shot, count: int) -> list[FrameResult]:
+    """So many registered frames, all over the shot."""
     registered = shot.reconstruction.registered
-    chosen = [registered[k] for k in np.unique(np.linspace(0, len(registered) - 1, FRAMES).astype(int))]
+    return [registered[k] for k in np.unique(np.linspace(0, len(registered) - 1, count).astype(int))]
+
+
+def _from_photos(shot: Shot) -> tuple[Array, float] | None:
+    folder = shot.footage
+    if folder is None or not folder.is_dir():
+        return None
+    return up_from_photos(
+        (folder / frame.name, shot.reconstruction.camera_of(frame), pose)
+        for frame in _spread(shot, _PHOTOS)
+        if (pose := frame.cam_from_world) is not None and (folder / frame.name).is_file()
+    )
+
+
+def _from_edges(shot: Shot) -> tuple[Array, float] | None:
+    chosen = _spread(shot, FRAMES)
     views = (
         (image.image, shot.reconstruction.camera_of(frame), frame.cam_from_world)
         for frame, image in zip(chosen, frames_of(shot, chosen), strict=True)

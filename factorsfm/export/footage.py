@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from factorsfm.export.shot import Shot
 from factorsfm.frames.folders import list_images
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.numbering import missing_numbers
+from factorsfm.frames.photographs import in_format_of
 from factorsfm.frames.reading import read_frames
 from factorsfm.frames.sequences import NUMBERED, sequence_numbers
+from factorsfm.frames.unordered import read_images
 from factorsfm.result.reconstruction import FrameResult
 from factorsfm.support.errors import InputError
 
@@ -88,22 +90,33 @@ def image_sequence(folder: Path) -> Sequence:
 
 
 def frames_of(shot: Shot, frames: Iterable[FrameResult]) -> Iterator[Frame]:
-    """The images of some frames of the result, in order, from its footage.
+    """The images of some frames of the result, in order, from its footage; photographs as they were solved.
 
     Raises:
         InputError: while iterating, if the footage has no such frame, or another size.
     """
     assert shot.footage is not None
     wanted = [(frame, frame.index + shot.numbering.shift) for frame in frames]
-    images = read_frames(shot.footage, slice(wanted[0][1], wanted[-1][1] + 1), fields=shot.fields)
+    are_photographs = bool(shot.reconstruction.options.get("unordered"))
+    images = _read(shot, slice(wanted[0][1], wanted[-1][1] + 1), photographs=are_photographs)
     for frame, index in wanted:
         found = next((image for image in images if image.index == index), None)
         if found is None:
             raise InputError(f"{shot.footage} has no frame {index}; it is not the shot of this result")
-        camera, (height, width) = shot.reconstruction.camera_of(frame), found.image.shape[:2]
+        camera = shot.reconstruction.camera_of(frame)
+        if are_photographs:
+            found = replace(found, image=in_format_of(camera, found.image))
+        height, width = found.image.shape[:2]
         if (width, height) != (camera.width, camera.height):
             raise InputError(
                 f"frame {index} of {shot.footage} has {width}x{height} pixels, "
                 f"the result {camera.width}x{camera.height}"
             )
         yield found
+
+
+def _read(shot: Shot, part: slice, *, photographs: bool) -> Iterator[Frame]:
+    assert shot.footage is not None
+    if not photographs:
+        return read_frames(shot.footage, part, fields=shot.fields)
+    return (image for image in read_images(shot.footage, part) if isinstance(image, Frame))

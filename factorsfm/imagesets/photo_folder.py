@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.frames.frame import Frame
+from factorsfm.frames.photographs import turned_left
 from factorsfm.frames.writing import FAST_PNG, write_image
 from factorsfm.support.errors import InputError
 
@@ -100,10 +101,10 @@ class PhotoFolder:
     def turn(self, photo: Photo) -> None:
         """Turn the working copy by 90 degrees."""
         turned = photo.file.replace(".png", "-turned.png")
-        write_once(self.images / turned, cv2.rotate(self.read(photo), cv2.ROTATE_90_COUNTERCLOCKWISE))
+        write_once(self.images / turned, turned_left(self.read(photo)))
         if self.masks is not None:
             sideways = cv2.imread(str(self.masks / f"{photo.file}.png"), cv2.IMREAD_GRAYSCALE)
-            write_once(self.masks / f"{turned}.png", cv2.rotate(sideways, cv2.ROTATE_90_COUNTERCLOCKWISE))
+            write_once(self.masks / f"{turned}.png", turned_left(np.asarray(sideways, np.uint8)))
         photo.remark = "turned left by 90 degrees to the format of the others; its pose is that of the turned image"
         logger.warning("%s is %s", photo.name, photo.remark)
         photo.file, photo.size, photo.full_size = turned, photo.size[::-1], photo.full_size[::-1]

@@ -18,8 +18,9 @@ class Alignment:
     """Where up, the ground, the origin and the unit of a result come from; its world is x right, -y up, z ahead.
 
     Attributes:
-        up_from: what says where up is: "imu", "edges" (straight ones in the images), "ground", "picks"; empty if
-            nothing does. up_std: standard deviation about its worst axis, degrees; None if nothing does.
+        up_from: what says where up is: "imu", "photos" (phones and drones write it into them), "edges" (straight ones
+            in the images), "ground", "picks"; empty if nothing does.
+        up_std: standard deviation about its worst axis, degrees; None if nothing does.
         ground_from: "points" that lie on it, or "picks"; None if the ground is not known.
         ground_height, ground_std: of the ground above the origin, and standard deviation of the height of the first
             camera above the ground, units of the result; None if the ground is not known.
