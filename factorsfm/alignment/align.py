@@ -15,7 +15,7 @@ from factorsfm.alignment.planes import TOLERANCE
 from factorsfm.alignment.up import Up, camera_up, find_up
 from factorsfm.export.options import ExportOptions
 from factorsfm.export.shot import Defaults, Shot, make_shot
-from factorsfm.result.alignment import Alignment
+from factorsfm.result.alignment import FREE_SCALE, Alignment
 from factorsfm.result.other_world import in_other_world
 from factorsfm.result.reconstruction import Reconstruction
 from factorsfm.support.errors import InputError
@@ -214,7 +214,7 @@ class _Aligning:
         """What has been found, in the new unit."""
         ground, up, height = self.ground, self._up, self.height
         zero = -world.rotation.T @ world.translation
-        notes = self._notes if scale_from is not None else [*self._notes, "The scale is free."]
+        notes = self._notes if scale_from is not None else [*self._notes, FREE_SCALE]
         return Alignment(
             up_from=[] if up is None else up.sources,
             up_std=None if up is None else up.std,

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
+FREE_SCALE = "The scale is free."
 _SCALES = {
     "distance": "a distance",
     "height": "the height of the camera",
@@ -47,6 +48,20 @@ class Alignment:
     scale_from: str | None
     scale_std: float | None
     notes: list[str] = field(default_factory=list)
+
+    def in_unit(self, unit: float) -> Alignment:
+        """The same with all lengths `unit` times as long."""
+
+        def scaled(length: float | None) -> float | None:
+            return None if length is None else unit * length
+
+        return replace(
+            self,
+            ground_height=scaled(self.ground_height),
+            ground_std=scaled(self.ground_std),
+            camera_height=scaled(self.camera_height),
+            origin_std=scaled(self.origin_std),
+        )
 
     def sentences(self, unit: str) -> list[str]:
         """All of it in words; `unit`: "m" or "units"."""

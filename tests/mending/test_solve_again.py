@@ -22,7 +22,7 @@ from factorsfm import (
 )
 from factorsfm.cli.main import main
 from factorsfm.report.thumbnails import thumbnail
-from factorsfm.result.alignment import Alignment
+from factorsfm.result.alignment import FREE_SCALE, Alignment
 from factorsfm.result.other_world import in_other_world
 from factorsfm.result.tracks_file import read_tracks, write_tracks
 from factorsfm.support.similarity import Similarity
@@ -125,15 +125,57 @@ def test_tracks_regions_and_frames_are_left_out(result: Reconstruction, folder: 
         np.testing.assert_allclose(center, known[number], atol=2e-3)
 
 
-def test_the_world_stays(result: Reconstruction) -> None:
-    turned = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    alignment = Alignment(["ground"], 0.1, "points", 1.0, 0.1, 40, 1.0, "foot", None, "camera", None, None)
-    known = in_other_world(result, Similarity(2.5, turned, np.array([1.0, 2.0, 3.0])))
-    known = replace(known, alignment=alignment, metric=True)
-    again = solve_again(known)
-    assert_same_cameras(again, known, 0.01)
-    assert (again.alignment, again.metric) == (alignment, True)
-    np.testing.assert_allclose(again.points, known.points, rtol=1e-3)
+TURNED = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # the camera goes up
+ALIGNMENT = Alignment(
+    ["ground"], 0.1, "points", 1.0, 0.1, 40, 1.0, "foot", None, "camera", None, None, [FREE_SCALE, "other"]
+)
+
+
+@pytest.fixture(scope="module")
+def aligned(result: Reconstruction) -> Reconstruction:
+    """The first camera is 2 above the origin, and 1 above the ground."""
+    moved = in_other_world(result, Similarity(2.5, TURNED, np.array([1.0, -2.0, 3.0])))
+    return replace(moved, alignment=ALIGNMENT, metric=True)
+
+
+def test_the_world_stays(aligned: Reconstruction) -> None:
+    again = solve_again(aligned)
+    assert_same_cameras(again, aligned, 0.01)
+    assert again.alignment is not None
+    assert replace(again.alignment, camera_height=1.0) == ALIGNMENT
+    assert again.alignment.camera_height == pytest.approx(1.0, abs=1e-3)
+    assert again.metric
+    np.testing.assert_allclose(again.points, aligned.points, rtol=1e-3)
+
+
+def test_the_height_is_that_of_the_camera_that_is_the_first_now(aligned: Reconstruction) -> None:
+    again = solve_again(aligned, frames=slice(5, 9))
+    assert again.alignment is not None
+    height = -aligned.camera_centers()[5][1] - 1.0
+    assert abs(height - 1.0) > 0.01
+    assert again.alignment.camera_height == pytest.approx(height, abs=2e-3)
+
+
+def test_control_with_lengths_changes_the_unit_of_an_aligned_world_and_not_its_ground(aligned: Reconstruction) -> None:
+    long = float(np.linalg.norm(aligned.camera_centers()[8] - aligned.camera_centers()[0]))
+    again = solve_again(aligned, control=Control(distances=[KnownDistance(0.5 * long, 1e-4 * long, frames=[0, 8])]))
+    np.testing.assert_allclose(again.camera_centers(), 0.5 * aligned.camera_centers(), atol=2e-3)
+    np.testing.assert_allclose(again.points, 0.5 * aligned.points, rtol=1e-2)
+    found = again.alignment
+    assert found is not None
+    assert (found.scale_from, found.notes) == ("control", ["other"])
+    assert 2e-4 < found.scale_std < 6e-3  # of the distance, and of the path in the scene
+    assert (found.ground_height, found.ground_std) == pytest.approx((0.5, 0.05), rel=1e-3)
+    assert found.camera_height == pytest.approx(0.5, abs=1e-3)
+    further = solve_again(again, without_tracks=[int(again.track_ids[3]) + 1])
+    np.testing.assert_allclose(further.camera_centers(), again.camera_centers(), atol=2e-3)
+    assert further.alignment is not None
+    assert further.alignment.camera_height == pytest.approx(0.5, abs=1e-3)
+
+
+def test_the_first_camera_stays_at_the_origin_where_control_gives_lengths(result: Reconstruction) -> None:
+    again = solve_again(result, control=Control(distances=[KnownDistance(3.0, 0.01, frames=[0, 8])]))
+    np.testing.assert_allclose(again.camera_centers()[0], 0.0, atol=2e-3)
 
 
 def test_control_is_kept_until_there_is_another(result: Reconstruction, tmp_path: Path) -> None:
