@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,12 +56,12 @@ def find_up(result: Reconstruction, shot: Shot | None) -> Up | None:
     known: list[tuple[float, str, Array]] = []
     if result.imu is not None:
         known.append((result.imu.up_std, "imu", np.array(result.imu.up)))
-    if shot is not None:
+    if shot is not None and any(frame.registered for frame in shot.in_footage):
         for name, found in (("photos", _from_photos(shot)), ("edges", _from_edges(shot))):
             if found is not None:
                 known.append((found[1], name, found[0]))
     try:
-        plane = find_plane(result)
+        plane = find_plane(replace(result, alignment=None))  # an earlier one is no evidence
     except InputError:  # too few points for any plane
         plane = None
     if plane is not None and plane.kind == "ground":
@@ -81,8 +81,8 @@ def find_up(result: Reconstruction, shot: Shot | None) -> Up | None:
 
 
 def _spread(shot: Shot, count: int) -> list[FrameResult]:
-    """So many registered frames, all over the shot."""
-    registered = shot.reconstruction.registered
+    """So many registered frames, all over the footage."""
+    registered = [frame for frame in shot.in_footage if frame.registered]
     return [registered[k] for k in np.unique(np.linspace(0, len(registered) - 1, count).astype(int))]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -91,7 +91,7 @@ def write_overlay(
     hide: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> Props:
-    """Write the footage with what is locked into the scene drawn over it, one picture a frame of the reconstruction.
+    """Write the footage with what is locked into the scene drawn over it, one picture a frame of the result.
 
     Args:
         path: .mp4, .mov or .avi (JPEG pictures: larger and better). Its pixels are square: squeezed footage is
@@ -116,9 +116,10 @@ def write_overlay(
     shot = make_shot(reconstruction, ExportOptions(footage=source), Defaults())
     if shot.footage is None:
         raise InputError("the source of this result is not where it was; say where the shot is")
-    reconstruction = shot.reconstruction  # in its own world, at the size of the footage
+    # In its own world, at the size of the footage.
+    reconstruction = replace(shot.reconstruction, alignment=reconstruction.alignment)
     props, projector = place_props(reconstruction), Projector.of(reconstruction)
-    frames = reconstruction.frames
+    frames = shot.in_footage
     step = np.median(np.diff([frame.index for frame in frames])) if len(frames) > 1 else 1
     layers = [layer for layer in LAYERS if layer not in hide]
     with complete_file(path) as file:

@@ -65,6 +65,20 @@ def test_a_scene_stands_on_its_floor_below_the_first_camera() -> None:
             )
 
 
+def test_an_earlier_alignment_is_no_evidence() -> None:
+    """Wrong picks can be taken back, and to align twice changes nothing."""
+    result = room()
+    places = ([0.3, FLOOR, 4.5], [-0.6, FLOOR, 5.5], [0.5, 0.3 * FLOOR, 6.0])
+    wrong = align(result, **dict(zip(("origin", "axis", "plane"), (pixel(result, p) for p in places), strict=True)))
+    up = wrong.frames[0].cam_from_world.rotation.matrix()[:, 1]  # down in the first camera, where the room is level
+    assert np.degrees(np.arccos(up[1])) > 5
+    once = align(result)
+    for again in (align(wrong), align(once)):
+        assert again.alignment.up_from == ["ground"]
+        np.testing.assert_allclose(again.points[:600, 1], 0, atol=1e-9)
+        assert again.alignment.camera_height == pytest.approx(HEIGHT, abs=1e-9)
+
+
 def test_origin_axis_and_scale_are_those_of_the_picks() -> None:
     result = room()
     a, b = np.array([0.3, FLOOR, 4.5]), np.array([-0.6, FLOOR, 5.5])

@@ -14,9 +14,12 @@ from factorsfm.frames.reading import read_frames
 from factorsfm.report.overlay import Projector, draw_overlay, write_overlay
 from factorsfm.report.props import place_props
 from factorsfm.report.result_folder import write_folder
+from factorsfm.result.alignment import Alignment
 from factorsfm.result.moving import Moving, MovingStretch
+from factorsfm.result.other_world import in_other_world
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.support.errors import InputError
+from factorsfm.support.similarity import Similarity
 from factorsfm.support.status import FrameStatus, ShotKind
 from tests.exact_result import build
 
@@ -254,6 +257,21 @@ def test_ranges_steps_and_odd_sizes(tmp_path: Path) -> None:
     assert frames[0].image.shape == (270, 482, 3)
     np.testing.assert_allclose([np.median(f.image) for f in frames], [16, 28, 40, 52, 64, 76], atol=2)
     assert frames[1].timestamp == pytest.approx(3 / 25, abs=2e-5)
+
+
+def test_the_grid_is_on_the_ground_to_which_the_result_is_aligned(tmp_path: Path) -> None:
+    """Also where a wall has more points than what lies on the ground."""
+    points = floor_and_clutter(floor=16, clutter=0, wall=600)
+    points[:16, 1] = FLOOR
+    first = (result := solved(points)).frames[0].cam_from_world
+    result = in_other_world(result, Similarity(1.0, first.rotation.matrix(), first.translation))
+    assert place_props(result).plane.kind == "plane"
+    known = Alignment(["picks"], 0.1, "picks", -FLOOR, 0.1, 3, FLOOR, "camera", None, "camera", None, None)
+    aligned = replace(result, alignment=known)
+    props = write_overlay(aligned, tmp_path / "o.avi", write_footage(tmp_path / "shot.avi"), hide=["grid", "cubes"])
+    assert props.plane.kind == "ground"
+    np.testing.assert_allclose(props.plane.axes[2], [0, -1, 0], atol=1e-9)
+    np.testing.assert_allclose(props.plane.origin[1], FLOOR, atol=1e-9)
 
 
 def replace_width(width: int) -> pycolmap.Camera:
