@@ -95,7 +95,7 @@ class Inputs:
     def described(self) -> dict[str, Any]:
         """What is written beside the options of a result."""
         return {
-            "source": str(self.source) if isinstance(self.source, str | Path) else "frames",
+            "source": str(Path(self.source).absolute()) if isinstance(self.source, str | Path) else "frames",
             "unordered": self.unordered,
             "features": str(self.features),
             "tracks": None if self.tracks is None else self.tracks.source,

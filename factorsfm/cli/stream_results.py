@@ -38,6 +38,8 @@ class StreamResults:
         self._given = as_given(arguments)
         if "://" in arguments.source:  # it may hold a password
             self._given["source"] = source.name
+        elif (path := Path(arguments.source)).exists():
+            self._given["source"] = str(path.absolute())
 
     def write(self, stream: Stream, viewer: Viewer, progress: Progress) -> str:
         """Finish a stream, write its result or the reason of the failure, and return the sentences for the user."""

@@ -184,7 +184,7 @@ def _footage(shot: Shot) -> dict[str, Any] | None:
         duration = footage.last - footage.first + 1
     else:
         file, source, offset = footage, "MOVIE", 0
-        duration = shot.reconstruction.frames[-1].index + shot.numbering.shift + 1
+        duration = shot.in_footage[-1].index + shot.numbering.shift + 1
     return {
         "file": str(file),
         "source": source,

@@ -55,6 +55,9 @@ def background(shot: Shot) -> Path | Sequence | None:
     """
     path = shot.footage
     if path is None:
+        said = shot.reconstruction.options.get("source")
+        if isinstance(said, str) and Path(said).is_absolute():
+            logger.warning("the footage %s is not where it was, and no plate is written; --footage says where", said)
         return None
     if path.is_file():
         return path.absolute()

@@ -119,7 +119,7 @@ def _plate(shot: Shot, footage: Path | Sequence | None) -> str:
     if isinstance(footage, Sequence):
         file, first, last = footage.pattern, footage.first, footage.last
     else:
-        file, first, last = footage.as_posix(), 1, shot.reconstruction.frames[-1].index + shot.numbering.shift + 1
+        file, first, last = footage.as_posix(), 1, shot.in_footage[-1].index + shot.numbering.shift + 1
     return _node(
         "Read",
         inputs=0,

@@ -21,7 +21,7 @@ from factorsfm.export.nulls import Null, moving_nulls, point_nulls
 from factorsfm.export.options import ExportOptions
 from factorsfm.export.other_footage import Numbering, at_size_of, match_numbers, of_source
 from factorsfm.frames.fields import Fields
-from factorsfm.result.image_sources import fields_of
+from factorsfm.result.image_sources import added_images, fields_of
 from factorsfm.result.other_world import in_other_world
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.result.supervised import named_points
@@ -143,6 +143,12 @@ class Shot:
     def footage_start(self) -> int:
         """Number of the first frame of the footage."""
         return self.first_frame + self.numbering.footage_first - self.numbering.shift
+
+    @cached_property
+    def in_footage(self) -> list[FrameResult]:
+        """The frames that the footage holds: not those of images that were added to the result."""
+        added = added_images(self.reconstruction.options)
+        return [frame for frame in self.reconstruction.frames if not added or frame.index < added[0].first]
 
     @cached_property
     def numbers(self) -> list[int]:

@@ -177,7 +177,7 @@ class _Extension:
             where = images if path is not None else "the sequence of images"
             raise InputError(f"there is no image to add in {where}{why}")
         if not own:
-            self._added.append(AddedImages(None if path is None else str(path), first))
+            self._added.append(AddedImages(None if path is None else str(path.absolute()), first))
 
     def _misfit(self, image: Frame) -> str:
         """Why an image cannot be from the result's camera; empty if it can."""
@@ -220,7 +220,7 @@ class _Extension:
         for view in self._new:
             if view not in registered:
                 result.notes.append(f"{view.frame.name} could not be registered: {view.frame.message}.")
-        return result
+        return _in_order(result)
 
     def _match(self, views: list[MatchedImage]) -> list[ImageTracks]:
         """Tracks of all images; their pixels and colours are left in the views."""
@@ -244,3 +244,11 @@ class _Extension:
             x, y = np.clip(np.rint(keypoints[rows][good]).astype(int), 0, np.array(view.size) - 1).T
             view.rgb = image[y, x][:, ::-1]
         return tracks
+
+
+def _in_order(result: Reconstruction) -> Reconstruction:
+    """The frames in the order of their indices, as tools expect them: those of the own source may come in between."""
+    order = np.argsort([frame.index for frame in result.frames], kind="stable")
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    return replace(result, frames=[result.frames[k] for k in order], observation_frame=rank[result.observation_frame])

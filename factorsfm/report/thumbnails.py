@@ -135,7 +135,7 @@ def retake(result: Reconstruction, footage: Path | None = None, width: int = _WI
         if shot.footage is None:
             return
         with Thumbnails(width=width) as thumbnails:
-            for image in frames_of(shot, result.frames):
+            for image in frames_of(shot, shot.in_footage):
                 thumbnails.add(image.image)
     except InputError as error:
         if footage is not None:
@@ -143,5 +143,5 @@ def retake(result: Reconstruction, footage: Path | None = None, width: int = _WI
         # a report without pictures is one, too
         logger.info("no thumbnails: %s", error)
         return
-    for frame, jpeg in zip(result.frames, thumbnails.by_frame(), strict=True):
+    for frame, jpeg in zip(result.frames[: len(shot.in_footage)], thumbnails.by_frame(), strict=True):
         frame.thumbnail = jpeg

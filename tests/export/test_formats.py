@@ -625,6 +625,23 @@ def test_source_is_the_footage_where_none_is_given(tmp_path: Path, caplog: pytes
     assert "the lens distorts" in caplog.text
 
 
+@pytest.mark.parametrize("format", ["nuke", "blender"])
+def test_footage_that_has_gone_is_named(tmp_path: Path, caplog: pytest.LogCaptureFixture, format: str) -> None:
+    gone = tmp_path / "gone.mp4"
+    export(hard_reconstruction(options={"source": str(gone)}), tmp_path / "out", format=format)
+    assert f"the footage {gone} is not where it was, and no plate is written; --footage says where" in caplog.text
+
+
+def test_frames_that_were_added_from_elsewhere_are_not_in_the_footage(tmp_path: Path) -> None:
+    footage = tmp_path / "shot.mp4"
+    footage.write_bytes(b"not looked at")
+    options = {"source": str(footage), "added": [{"source": str(tmp_path / "stills"), "first": 15}]}
+    export(hard_reconstruction(options=options), tmp_path / "out", format="nuke")
+    nodes = nuke_nodes((tmp_path / "out" / "camera.nk").read_text())
+    assert (nodes["Plate"]["first"], nodes["Plate"]["last"]) == ("1", "15")
+    assert nodes["Root"]["last_frame"] == "1021"
+
+
 def test_output_can_be_the_working_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     for _ in range(2):

@@ -176,11 +176,14 @@ def test_frames_of_a_video_are_added_and_exported_in_a_folder_of_its_name(materi
 
 
 @pytest.mark.slow
-def test_images_of_the_own_source_keep_their_index(material: Set) -> None:
+@pytest.mark.parametrize("first", [0, 3])
+def test_images_of_the_own_source_keep_their_index_and_come_in_its_order(material: Set, first: int) -> None:
     folder = material.folder / "all"
-    part = reconstruct(folder, camera=material.shot.camera, depth=None, unordered=True, frames=slice(0, 6))
+    known = slice(first, first + 6)
+    part = reconstruct(folder, camera=material.shot.camera, depth=None, unordered=True, frames=known)
     result = add_images(part, folder)
     assert [frame.index for frame in result.registered] == list(range(9))
+    assert_consistent(result)
     assert "added" not in result.options or result.options["added"] == []
     assert 5e-5 < material.errors(result).max() < 7e-4
 
