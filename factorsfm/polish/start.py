@@ -29,6 +29,7 @@ from factorsfm.polish.core_frames import core_frames, in_all_frames
 from factorsfm.polish.near_and_far import NearAndFar, near_and_far
 from factorsfm.polish.shot import Shot
 from factorsfm.polish.simple_readings import turning_reading, unless_at_rest
+from factorsfm.polish.stuck_frames import freed
 from factorsfm.support.options import Options, PolishOptions
 from factorsfm.support.status import ShotKind
 
@@ -159,7 +160,8 @@ def _solved_core(shot: Shot, frames: list[int], observations: Observations, trac
         reading, doubtful = Reading(found.kept, fixed), is_doubtful(fixed, options)
         return unannounced_zoom(first, whole, reading, shot.times(frames), o, doubtful=doubtful)
 
-    adjustment, few = found.adjustment, found.adjustment.observations
+    adjustment = freed(found.adjustment, np.array(frames), options) if shot.in_time else found.adjustment
+    few = adjustment.observations
     motion, lens, shutter, zoom = None, None, None, None
     if few.sweep is not None:
         motion = _motion(adjustment, found.rest, o)
