@@ -4,23 +4,20 @@ from __future__ import annotations
 
 import itertools
 import logging
-import re
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import cast
 
 import av
-import av.logging
 import numpy as np
 from av.container import InputContainer
-from av.error import FFmpegError, InvalidDataError
-from av.video.codeccontext import VideoCodecContext
+from av.error import FFmpegError
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
+from factorsfm.frames.container import decoded, has_decoder, opened_video, problem
 from factorsfm.frames.fields import Fields, FieldSplitter, blended, is_top_first, show_one_moment
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.picture import Orientation, Picture
@@ -33,9 +30,9 @@ VIDEO_SUFFIXES = (
     *(".mpg", ".mts", ".mxf", ".ogv", ".ts", ".webm", ".wmv"),
 )
 _SEEK_FROM = 100  # frames: decoding fewer is faster than reading the packets of the whole file
+_LEADS = (0, _SEEK_FROM)  # frames before the wanted one to jump to: TS and MPG lead past its keyframe
 _COMPARED = 16  # frames at the start of the file whose timestamps must be those of its packets
 _PROBED = 24  # frames of an interlaced file from which the order and the moments of its fields are read
-_FILE = "file:"  # the protocol before a path, without which FFmpeg takes some paths for others
 _ANNOUNCED_SHARE = 0.95  # of the frames that the container announces, which is not exact
 
 
@@ -48,6 +45,7 @@ class VideoFile:
         interval: seconds from a frame to the next as the container announces it, 0 if unknown.
         orientation: how images are turned upright.
         pixel_aspect: width of a shown pixel over its height.
+        announced: frames that the container announces, 0 if it does not say.
         interlaced: whether its frames hold fields of two moments; top_first: which of them is the earlier one.
     """
 
@@ -56,6 +54,7 @@ class VideoFile:
     interval: float
     orientation: Orientation
     pixel_aspect: float
+    announced: int
     interlaced: bool
     top_first: bool
 
@@ -66,11 +65,11 @@ def open_video(path: Path) -> VideoFile:
     Raises:
         InputError: the file is not a video, or cannot be decoded.
     """
-    with _opened(path) as (container, stream):
-        frames = _decoded(container, stream) if _has_decoder(stream) else iter(())
+    with opened_video(path) as (container, stream):
+        frames = decoded(container, stream) if has_decoder(stream) else iter(())
         first = next(frames, None)
         if first is None:
-            raise InputError(f"{path} cannot be decoded as a video; {_problem(path, stream)}")
+            raise InputError(f"{path} cannot be decoded as a video; {problem(path, stream)}")
         second = next(frames, None)
         timed = first.time is not None and second is not None and (second.time or 0.0) > first.time
         orientation = Orientation.of(first)
@@ -90,6 +89,7 @@ def open_video(path: Path) -> VideoFile:
             interval=float(1 / stream.guessed_rate) if stream.guessed_rate else 0.0,
             orientation=orientation,
             pixel_aspect=1.0 / aspect if orientation.turned else aspect,
+            announced=stream.frames,
             interlaced=interlaced,
             top_first=top_first,
         )
@@ -113,21 +113,16 @@ def decode(video: VideoFile, selection: slice, fields: Fields = "auto") -> Itera
     per_frame = 2 if apart else 1
     chosen = _Chosen(selection, per_frame)
     convert = _Converter(video, fields, FieldSplitter(video.top_first) if apart else None)
-    with _opened(video.path) as (container, stream):
-        frames = _from(container, stream, video, chosen.first_frame)
-        if frames is None:
-            container.seek(0, stream=stream)
-            frames = enumerate(_decoded(container, stream))
-        size = video.path.stat().st_size
-        position = -1
-        for position, frame in frames:
-            if chosen.is_over(position):
-                return
-            wanted = chosen.of_frame(position)
-            if wanted:
-                yield from convert(frame, wanted)
-        _warn_if_grown(position + 1, size, video.path)
-        _warn_if_short(position + 1, stream.frames, video.path)
+    size = video.path.stat().st_size
+    position = -1
+    for position, frame in _from(video, chosen.first_frame):
+        if chosen.is_over(position):
+            return
+        wanted = chosen.of_frame(position)
+        if wanted:
+            yield from convert(frame, wanted)
+    _warn_if_grown(position + 1, size, video.path)
+    _warn_if_short(position + 1, video.announced, video.path)
 
 
 def count_frames(path: Path) -> int:
@@ -136,8 +131,8 @@ def count_frames(path: Path) -> int:
     Raises:
         InputError: the file is not a video.
     """
-    with _opened(path) as (container, stream):
-        return sum(1 for _ in _decoded(container, stream))
+    with opened_video(path) as (container, stream):
+        return sum(1 for _ in decoded(container, stream))
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,83 +188,6 @@ class _Converter:
         return float(frame.duration * frame.time_base) if frame.duration and frame.time_base else self._video.interval
 
 
-@contextmanager
-def _opened(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
-    """The container and its video. A file that names others, as a playlist does, can name none of a network.
-
-    Raises:
-        InputError: it is no container, or holds no video.
-    """
-    try:
-        container = av.open(f"{_FILE}{path}", options={"protocol_whitelist": "file"})
-    except (FFmpegError, OSError, ValueError) as error:
-        raise InputError(
-            f"{path} cannot be decoded as a video; it is damaged, still being written, or not a video"
-        ) from error
-    with container:
-        if not container.streams.video:
-            raise InputError(f"{path} cannot be decoded as a video; it holds no picture")
-        stream = container.streams.video[0]
-        yield container, stream
-
-
-def _decoded(container: InputContainer, stream: VideoStream) -> Iterator[av.VideoFrame]:
-    """Frames from where the container stands. Damaged packets are left out, and a file may end inside of one.
-
-    Raises:
-        InputError: the file is gone, such as with the network that held it.
-    """
-    stream.thread_type = "AUTO"
-    packets = container.demux(stream)
-    while True:
-        try:
-            packet = next(packets, None)
-            if packet is None:
-                return
-            frames = _packet_frames(packet)
-        except InvalidDataError:
-            continue
-        except FFmpegError as error:
-            path = Path(container.name.removeprefix(_FILE))
-            try:
-                path.stat()
-            except OSError as gone:
-                raise InputError(f"{path} cannot be read any more: {gone.strerror}") from error
-            return
-        yield from frames
-
-
-def _packet_frames(packet: av.Packet[VideoStream]) -> list[av.VideoFrame]:
-    return packet.decode()
-
-
-def _problem(path: Path, stream: VideoStream) -> str:
-    """What is wrong with a file that gives no frame."""
-    cure = "convert it to H.264"
-    if _has_decoder(stream):
-        return f"its codec ({stream.codec_context.name}) finds no picture in it: it is damaged; {cure}"
-    return f"FFmpeg has no decoder for its codec ({_unknown_codec(path)}); {cure}"
-
-
-def _has_decoder(stream: VideoStream) -> bool:
-    return cast("VideoCodecContext | None", stream.codec_context) is not None
-
-
-def _unknown_codec(path: Path) -> str:
-    """Name or tag of a codec without decoder, which FFmpeg says in its log alone."""
-    level = av.logging.get_level()
-    av.logging.set_level(av.logging.WARNING)
-    try:
-        with av.logging.Capture() as log, _opened(path):
-            said = " ".join(message for _, _, message in log)
-    finally:
-        av.logging.set_level(level)
-    found = re.search(r"Video: (\w+)(?: \((\w+) /)?", said)
-    if found is None:
-        return "unknown"
-    return found[2] if found[1] == "none" and found[2] else found[1]
-
-
 def _warn_if_short(frames: int, announced: int, path: Path) -> None:
     """Log a warning if a file has clearly fewer frames than its container announces."""
     if frames < _ANNOUNCED_SHARE * announced - 1.0:
@@ -287,29 +205,34 @@ def _warn_if_grown(frames: int, size: int, path: Path) -> None:
             logger.warning("%s: more was written to it while it was read; its first %d frames are used", path, frames)
 
 
-def _from(
-    container: InputContainer, stream: VideoStream, video: VideoFile, position: int
-) -> Iterator[tuple[int, av.VideoFrame]] | None:
-    """Positions and frames, all or from a late one on; None if the late one was not found.
+def _from(video: VideoFile, position: int) -> Iterator[tuple[int, av.VideoFrame]]:
+    """Positions and frames, all, or from a late one on where that one is found without decoding all before it.
 
     Neither the frame count of a container nor its index can be trusted. But the packets of the file hold the timestamps
     of all frames, which are read without decoding, and the timestamp of the frame that is reached identifies it.
     """
-    if video.start is None or position < _SEEK_FROM:
-        return enumerate(_decoded(container, stream))
+    late = video.start is not None and position >= _SEEK_FROM
     status = video.path.stat()
-    times = _frame_times(video.path, status.st_size, status.st_mtime_ns)
-    if position >= len(times):
-        return None
+    times = _frame_times(video.path, status.st_size, status.st_mtime_ns) if late else np.zeros(0, np.int64)
+    for lead in _LEADS if position < len(times) else ():
+        with opened_video(video.path) as (container, stream):
+            frames = _reached(container, stream, int(times[position - lead]), int(times[position]))
+            if frames is not None:
+                yield from enumerate(frames, position)
+                return
+    with opened_video(video.path) as (container, stream):
+        yield from enumerate(decoded(container, stream))
+
+
+def _reached(container: InputContainer, stream: VideoStream, aim: int, wanted: int) -> Iterator[av.VideoFrame] | None:
+    """Frames from that with the wanted timestamp on, after a jump to `aim`; None if it is not found so."""
     try:
-        container.seek(int(times[position]), stream=stream)
+        container.seek(aim, stream=stream)
     except FFmpegError:
         return None
-    frames = _decoded(container, stream)
-    reached = next((frame for frame in frames if frame.pts is not None and frame.pts >= times[position]), None)
-    if reached is None or reached.pts != times[position]:
-        return None
-    return enumerate(itertools.chain([reached], frames), position)
+    frames = decoded(container, stream)
+    first = next((frame for frame in frames if frame.pts is not None and frame.pts >= wanted), None)
+    return itertools.chain([first], frames) if first is not None and first.pts == wanted else None
 
 
 @lru_cache(8)
@@ -322,10 +245,10 @@ def _frame_times(path: Path, size: int, modified_ns: int) -> NDArray[np.int64]:
     Args:
         size, modified_ns: of the file now; a file that changes is read again.
     """
-    with _opened(path) as (container, stream):
+    with opened_video(path) as (container, stream):
         packets = [packet.pts for packet in container.demux(stream) if packet.size]
-    with _opened(path) as (container, stream):
-        first = [frame.pts for frame in itertools.islice(_decoded(container, stream), _COMPARED)]
+    with opened_video(path) as (container, stream):
+        first = [frame.pts for frame in itertools.islice(decoded(container, stream), _COMPARED)]
     if any(time is None for time in (*packets, *first)):
         return np.zeros(0, np.int64)
     times = np.sort(np.array(packets, np.int64))

@@ -74,14 +74,14 @@ def numbers(frames) -> list[int]:
 @pytest.mark.parametrize("sought", [True, False])
 def test_a_late_range_of_a_long_video_is_exact_though_most_of_it_is_not_decoded(long_video, monkeypatch, sought):
     decoded = []
-    frames_of = video_files._decoded
+    frames_of = video_files.decoded
 
     def counted(container, stream):
         for frame in frames_of(container, stream):
             decoded.append(frame.pts)
             yield frame
 
-    monkeypatch.setattr(video_files, "_decoded", counted)
+    monkeypatch.setattr(video_files, "decoded", counted)
     if not sought:  # two frames at one time: their packets do not tell them apart
         monkeypatch.setattr(video_files, "_frame_times", lambda *file: np.zeros(0))
     frames = list(read_frames(long_video, slice(200, 230, 10)))

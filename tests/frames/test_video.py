@@ -86,6 +86,26 @@ def test_uneven_times_are_kept(tmp_path):
     assert [frame.timestamp for frame in read_frames(path)] == pytest.approx(np.array(times) / 100, abs=1e-3)
 
 
+@pytest.mark.parametrize(("suffix", "codec"), [(".ts", "libx264"), (".mpg", "mpeg2video"), (".avi", "mpeg4")])
+def test_a_late_range_holds_the_frames_that_it_names(tmp_path, suffix, codec):
+    """These containers have no index of their keyframes, and a jump lands behind the one that is needed."""
+    options = {"g": "50", "bf": "2"}
+    path = write_video(tmp_path / f"shot{suffix}", moving_texture(130, size=(160, 120)), codec, options=options)
+    everything = list(read_frames(path))
+    for start in (100, 107, 119, 127):
+        late = list(read_frames(path, slice(start, None)))
+        assert [frame.index for frame in late] == list(range(start, len(everything)))
+        for frame, same in zip(late, everything[start:], strict=True):
+            assert frame.timestamp == same.timestamp
+            np.testing.assert_array_equal(frame.image, same.image)
+
+
+def test_a_late_range_that_no_jump_finds_is_decoded_from_the_start(tmp_path, monkeypatch):
+    path = write_video(tmp_path / "shot.mkv", moving_texture(110, size=(160, 120)))
+    monkeypatch.setattr("factorsfm.frames.video._reached", lambda *_: None)
+    assert [frame.index for frame in read_frames(path, slice(104, 107))] == [104, 105, 106]
+
+
 def test_a_file_that_grows_is_read_as_far_as_it_was_and_warned_of(tmp_path, caplog):
     path = write_video(tmp_path / "shot.ts", moving_texture(40), "mpeg2video")
     data = path.read_bytes()
@@ -111,7 +131,7 @@ def test_a_file_that_vanishes_with_its_network_is_no_shorter_file(tmp_path, monk
     def fail(_: object) -> None:
         raise av.error.OSError(5, "Input/output error")
 
-    monkeypatch.setattr("factorsfm.frames.video._packet_frames", fail)
+    monkeypatch.setattr("factorsfm.frames.container._packet_frames", fail)
     path.unlink()
     with pytest.raises(InputError, match=r"shot\.mkv cannot be read any more: No such file"):
         list(frames)
