@@ -204,6 +204,43 @@ def test_film_that_is_stored_as_interlaced_stays_whole(tmp_path):
     assert len(apart) == 24
 
 
+def detailed(count: int, step: float) -> list[np.ndarray]:
+    """Moving texture that differs strongly from line to line, and a still half with grain."""
+    rng = np.random.default_rng(1)
+    lines = rng.normal(0.0, 25.0, (240, 1, 1))
+    images = []
+    for image in moving_texture(count, step):
+        image = 0.6 * image.astype(np.float64) + 50 + lines
+        image[:, 160:] = image[:, :1]
+        images.append(np.clip(image + rng.normal(0.0, 2.0, (240, 320, 1)), 0, 255).astype(np.uint8))
+    return images
+
+
+@pytest.mark.parametrize("top_first", [True, False])
+@pytest.mark.parametrize("codec", ["libx264", "mpeg2video"])
+@pytest.mark.parametrize("step", [1.0, 7.0])
+def test_vertical_detail_is_no_second_moment(tmp_path, codec, top_first, step):
+    """The lines of two fields differ by the detail of the picture, which outweighs slow motion."""
+    film = [image for image in detailed(26, step) for _ in range(2)]
+    stored = interlaced(tmp_path / "film.mkv", film, codec, top_first=top_first)
+    assert next(read_frames(stored)).image.shape == (240, 320, 3)
+    video = interlaced(tmp_path / "video.mkv", detailed(52, step / 2), codec, top_first=top_first)
+    assert next(read_frames(video)).image.shape == (120, 320, 3)
+
+
+def test_where_nothing_moves_the_flags_count(tmp_path):
+    path = interlaced(tmp_path / "shot.mkv", detailed(52, 0.0), top_first=True)
+    assert next(read_frames(path)).image.shape == (120, 320, 3)
+
+
+def test_film_whose_fields_are_spread_over_video_frames_is_taken_apart(tmp_path):
+    """24 in 30 frames a second by fields: two of five frames hold fields of two images."""
+    film = detailed(20, 4.0)
+    fields = [image for k, image in enumerate(film) for _ in range(2 + k % 2)]
+    path = interlaced(tmp_path / "shot.mkv", fields, top_first=True)
+    assert next(read_frames(path)).image.shape == (120, 320, 3)
+
+
 def test_progressive_video_is_taken_apart_on_demand(tmp_path):
     path = write_video(tmp_path / "shot.mkv", woven(moving_texture(8, 3.0), top_first=True), **LOSSLESS)
     assert len(list(read_frames(path))) == 4
