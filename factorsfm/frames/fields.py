@@ -24,6 +24,8 @@ Fields = Literal["auto", "apart", "blend"]
 _QUARTER = np.array([-0.0703125, 0.8671875, 0.2265625, -0.0234375])
 _BLEND = np.array([0.25, 0.5, 0.25])  # a line of one field, and the mean of its neighbours of the other
 _ONE_MOMENT = 0.25  # mean moment of the later fields, in frames: 0 of film, 0.5 of two moments at even steps
+# Few pairs of frames tell less, and a video is refused by them: 4 pairs at least, and 24 at most.
+_TWO_MOMENTS, _TELLING, _WATCHED = 0.35, 4, 24
 _STRONGEST = 0.99  # quantile of the motion from which pixels tell moments: grain and compression move the others
 _STILL = 3.0  # grey levels: grain and compression make as much
 
@@ -106,26 +108,41 @@ def show_one_moment(frames: Sequence[av.VideoFrame], *, top_first: bool) -> bool
     The later field of a frame is then of the moment of the earlier one; else it lies in the middle between this and
     that of the next frame. A still shot does not tell, and its frames count as interlaced.
     """
-    lumas = [_luma(frame).astype(np.float32) for frame in frames]
-    moments = [_moment(*pair, 0 if top_first else 1) for pair in itertools.pairwise(lumas)]
-    told = [min(max(moment, 0.0), 1.0) for moment in moments if moment is not None]
+    pairs = [pair for pair in itertools.pairwise(frames) if pair[0].interlaced_frame]
+    moments = [_moment(*pair, top_first=top_first) for pair in pairs]
+    told = [moment for moment in moments if moment is not None]
     return bool(told) and float(np.mean(told)) < _ONE_MOMENT
 
 
-def _moment(luma: NDArray[np.float32], following: NDArray[np.float32], first: int) -> float | None:
+class CombWatch:
+    """Watches for frames of two moments in a video that began without frames flagged as interlaced."""
+
+    def __init__(self) -> None:
+        self._before: av.VideoFrame | None = None
+        self._told: list[float] = []
+
+    def push(self, frame: av.VideoFrame) -> bool:
+        """Whether the frames up to the next one have shown that flagged ones among them hold two moments."""
+        before, self._before = self._before, frame if frame.interlaced_frame else None
+        if before is not None and len(self._told) < _WATCHED and before.format.name == frame.format.name:
+            moment = _moment(before, frame, top_first=is_top_first([before], 0))
+            self._told += [] if moment is None else [moment]
+        return len(self._told) >= _TELLING and float(np.mean(self._told)) > _TWO_MOMENTS
+
+
+def _moment(frame: av.VideoFrame, following: av.VideoFrame, *, top_first: bool) -> float | None:
     """When the later field of a frame was seen: 0 with its earlier field, 1 with that of the next frame.
 
     The difference between the two earlier fields, which have the same lines, is motion alone. The share of it that the
     later field has gone through is found by least squares: what its other lines show besides, the vertical detail of
     the picture, is as near to both and does not count.
 
-    Args:
-        luma, following: (h, w) two frames, one after the other; first: the first line of the earlier fields.
-
     Returns:
-        None where nothing moves.
+        0 to 1; None where nothing moves.
     """
-    before, after = (0.5 * (frame[first::2][:-1] + frame[first::2][1:]) for frame in (luma, following))
+    luma, luma_after = (_luma(image).astype(np.float32) for image in (frame, following))
+    first = 0 if top_first else 1  # line of the earlier fields
+    before, after = (0.5 * (lines[first::2][:-1] + lines[first::2][1:]) for lines in (luma, luma_after))
     later = luma[1 - first :: 2][first:][: len(before)]
     before, after = before[: len(later)], after[: len(later)]
     motion = after - before
@@ -134,7 +151,8 @@ def _moment(luma: NDArray[np.float32], following: NDArray[np.float32], first: in
     if least < _STILL:
         return None
     moved = strength >= least
-    return float((motion * (later - before))[moved].sum() / (motion[moved] ** 2).sum())
+    share = float((motion * (later - before))[moved].sum() / (motion[moved] ** 2).sum())
+    return min(max(share, 0.0), 1.0)
 
 
 def _luma(frame: av.VideoFrame) -> Image:

@@ -18,7 +18,7 @@ from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
 from factorsfm.frames.container import decoded, has_decoder, opened_video, problem
-from factorsfm.frames.fields import Fields, FieldSplitter, blended, is_top_first, show_one_moment
+from factorsfm.frames.fields import CombWatch, Fields, FieldSplitter, blended, is_top_first, show_one_moment
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.picture import Orientation, Picture
 from factorsfm.support.errors import InputError
@@ -32,7 +32,7 @@ VIDEO_SUFFIXES = (
 _SEEK_FROM = 100  # frames: decoding fewer is faster than reading the packets of the whole file
 _LEADS = (0, _SEEK_FROM)  # frames before the wanted one to jump to: TS and MPG lead past its keyframe
 _COMPARED = 16  # frames at the start of the file whose timestamps must be those of its packets
-_PROBED = 24  # frames of an interlaced file from which the order and the moments of its fields are read
+_PROBED = 26  # frames of a file from which fields, their order and their moments are read
 _ANNOUNCED_SHARE = 0.95  # of the frames that the container announces, which is not exact
 
 
@@ -46,7 +46,8 @@ class VideoFile:
         orientation: how images are turned upright.
         pixel_aspect: width of a shown pixel over its height.
         announced: frames that the container announces, 0 if it does not say.
-        interlaced: whether its frames hold fields of two moments; top_first: which of them is the earlier one.
+        interlaced: whether its frames hold fields of two moments; film: whether they are flagged so, but hold one.
+        top_first: whether the field of the lines 0, 2, 4, ... is the earlier one.
     """
 
     path: Path
@@ -56,6 +57,7 @@ class VideoFile:
     pixel_aspect: float
     announced: int
     interlaced: bool
+    film: bool
     top_first: bool
 
 
@@ -75,14 +77,12 @@ def open_video(path: Path) -> VideoFile:
         orientation = Orientation.of(first)
         aspect = float(stream.sample_aspect_ratio or 1) or 1.0
         order = int(stream.codec_context.field_order or 0)
-        probed = [first, *([] if second is None else [second])]
-        interlaced = any(frame.interlaced_frame for frame in probed)
-        if interlaced:
-            probed += itertools.islice(frames, _PROBED)
-        top_first = not interlaced or is_top_first(probed, order)
-        if interlaced and show_one_moment(probed, top_first=top_first):
+        probed = [first, *([] if second is None else [second]), *itertools.islice(frames, _PROBED - 2)]
+        flagged = [frame for frame in probed if frame.interlaced_frame]
+        top_first = not flagged or is_top_first(flagged, order)
+        film = bool(flagged) and show_one_moment(probed, top_first=top_first)
+        if film:
             logger.info("%s is interlaced, but both fields of a frame show one moment: frames stay whole", path)
-            interlaced = False
         return VideoFile(
             path=path,
             start=first.time if timed else None,
@@ -90,7 +90,8 @@ def open_video(path: Path) -> VideoFile:
             orientation=orientation,
             pixel_aspect=1.0 / aspect if orientation.turned else aspect,
             announced=stream.frames,
-            interlaced=interlaced,
+            interlaced=bool(flagged) and not film,
+            film=film,
             top_first=top_first,
         )
 
@@ -107,17 +108,23 @@ def decode(video: VideoFile, selection: slice, fields: Fields = "auto") -> Itera
             case.
 
     Raises:
-        InputError: the file cannot be opened or read any more.
+        InputError: the file cannot be opened or read any more, or interlaced frames come after others.
     """
     apart = fields == "apart" or (fields == "auto" and video.interlaced)
     per_frame = 2 if apart else 1
     chosen = _Chosen(selection, per_frame)
     convert = _Converter(video, fields, FieldSplitter(video.top_first) if apart else None)
+    watch = CombWatch() if fields == "auto" and not (video.interlaced or video.film) else None
     size = video.path.stat().st_size
     position = -1
     for position, frame in _from(video, chosen.first_frame):
         if chosen.is_over(position):
             return
+        if watch is not None and watch.push(frame):
+            raise InputError(
+                f"{video.path} is interlaced before frame {position}, but not at its beginning; "
+                "fields apart or blend (--fields) is expected for such a video"
+            )
         wanted = chosen.of_frame(position)
         if wanted:
             yield from convert(frame, wanted)

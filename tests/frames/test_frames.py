@@ -87,7 +87,7 @@ def test_a_late_range_of_a_long_video_is_exact_though_most_of_it_is_not_decoded(
     frames = list(read_frames(long_video, slice(200, 230, 10)))
     assert [frame.index for frame in frames] == numbers(frames) == [200, 210, 220]
     assert [frame.timestamp for frame in frames] == pytest.approx([8.0, 8.4, 8.8], abs=1e-6)
-    assert len(decoded) < 60 if sought else len(decoded) >= 221
+    assert len(decoded) < 90 if sought else len(decoded) >= 221
 
 
 def test_parse_range():

@@ -1,6 +1,7 @@
 """Video files as they come: codecs, containers, times, fields, pixel aspect, orientation and colour."""
 
 from fractions import Fraction
+from pathlib import Path
 
 import av
 import cv2
@@ -239,6 +240,38 @@ def test_film_whose_fields_are_spread_over_video_frames_is_taken_apart(tmp_path)
     fields = [image for k, image in enumerate(film) for _ in range(2 + k % 2)]
     path = interlaced(tmp_path / "shot.mkv", fields, top_first=True)
     assert next(read_frames(path)).image.shape == (120, 320, 3)
+
+
+def joined(tmp_path, whole: list[np.ndarray], moments: list[np.ndarray]) -> Path:
+    """A video of whole frames that becomes interlaced."""
+    first = write_video(tmp_path / "first.ts", whole)
+    path = interlaced(tmp_path / "shot.ts", moments)
+    path.write_bytes(first.read_bytes() + path.read_bytes())
+    return path
+
+
+def test_frames_that_become_interlaced_soon_are_taken_apart(tmp_path):
+    moments = detailed(60, 2.0)
+    path = joined(tmp_path, moments[:20:2], moments[20:])
+    frames = list(read_frames(path))
+    assert len(frames) == 60
+    assert frames[0].is_field
+
+
+def test_frames_that_become_interlaced_late_are_not_tracked_combed(tmp_path):
+    moments = detailed(120, 2.0)
+    path = joined(tmp_path, moments[:80:2], moments[80:])
+    with pytest.raises(InputError, match=r"shot\.ts is interlaced before frame 4\d, but not at its beginning; fields"):
+        list(read_frames(path))
+    assert len(list(read_frames(path, slice(0, 30)))) == 30
+    assert len(list(read_frames(path, fields="apart"))) == 120
+    assert len(list(read_frames(path, fields="blend"))) == 60
+
+
+def test_frames_of_one_moment_that_are_flagged_late_stay_whole(tmp_path):
+    film = detailed(60, 2.0)
+    path = joined(tmp_path, film[:40], [image for image in film[40:] for _ in range(2)])
+    assert len(list(read_frames(path))) == 60
 
 
 def test_progressive_video_is_taken_apart_on_demand(tmp_path):
