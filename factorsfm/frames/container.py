@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -43,32 +44,70 @@ def opened_video(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
 
 
 def decoded(container: InputContainer, stream: VideoStream) -> Iterator[av.VideoFrame]:
-    """Frames from where the container stands. Damaged packets are left out, and a file may end inside of one.
+    """Frames from where the container stands, without corrupt ones.
+
+    Raises:
+        InputError: see `decoded_with_damage`.
+    """
+    return (frame for frame, _ in decoded_with_damage(container, stream) if not frame.is_corrupt)
+
+
+def decoded_with_damage(container: InputContainer, stream: VideoStream) -> Iterator[tuple[av.VideoFrame, bool]]:
+    """Frames from where the container stands, and whether damage was met since the one before.
+
+    Damaged packets are left out, and a file may end inside of one.
 
     Raises:
         InputError: the file is gone, such as with the network that held it.
     """
-    packets = container.demux(stream)
-    while True:
+    damaged = False
+    for packet, following in itertools.pairwise(itertools.chain(_packets(container, stream), [None])):
+        damaged |= packet is None or packet.is_corrupt
+        # One that the end of the file cuts off would take those with it that are decoded beside it.
+        if packet is not None and packet.is_corrupt and (following is None or not following.size):
+            continue
         try:
-            packet = next(packets, None)
-            if packet is None:
-                return
-            frames = _packet_frames(packet)
+            frames = _packet_frames(stream, packet)
         except InvalidDataError:
+            damaged = True
             continue
         except FFmpegError as error:
-            path = Path(container.name.removeprefix(_FILE))
-            try:
-                path.stat()
-            except OSError as gone:
-                raise InputError(f"{path} cannot be read any more: {gone.strerror}") from error
+            _refuse_if_gone(container, error)
             return
-        yield from frames
+        for frame in frames:
+            yield frame, damaged or frame.is_corrupt
+            damaged = False
 
 
-def _packet_frames(packet: av.Packet[VideoStream]) -> list[av.VideoFrame]:
-    return packet.decode()
+def _packets(container: InputContainer, stream: VideoStream) -> Iterator[av.Packet[VideoStream] | None]:
+    """Packets from where the container stands, and None where it breaks off: the decoder still holds frames then."""
+    try:
+        yield from container.demux(stream)
+    except FFmpegError as error:
+        _refuse_if_gone(container, error)
+        yield None
+
+
+def _packet_frames(stream: VideoStream, packet: av.Packet[VideoStream] | None) -> list[av.VideoFrame]:
+    return stream.decode(packet)
+
+
+def _refuse_if_gone(container: InputContainer, error: FFmpegError) -> None:
+    path = Path(container.name.removeprefix(_FILE))
+    try:
+        path.stat()
+    except OSError as gone:
+        raise InputError(f"{path} cannot be read any more: {gone.strerror}") from error
+
+
+def announced_seconds(container: InputContainer, stream: VideoStream) -> float:
+    """How long the container says that the video is, 0 if it does not say or means something else beside it."""
+    if stream.duration is not None and stream.time_base is not None:
+        return float(stream.duration * stream.time_base)
+    stated = re.fullmatch(r"(\d+):(\d+):([\d.]+)", stream.metadata.get("DURATION", ""))
+    if stated is not None:
+        return 3600.0 * int(stated[1]) + 60.0 * int(stated[2]) + float(stated[3])
+    return (container.duration or 0) / av.time_base if len(container.streams) == 1 else 0.0
 
 
 def problem(path: Path, stream: VideoStream) -> str:

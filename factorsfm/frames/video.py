@@ -12,12 +12,18 @@ from pathlib import Path
 
 import av
 import numpy as np
-from av.container import InputContainer
 from av.error import FFmpegError
-from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
-from factorsfm.frames.container import decoded, has_decoder, opened_video, problem
+from factorsfm.frames.container import (
+    announced_seconds,
+    decoded,
+    decoded_with_damage,
+    has_decoder,
+    opened_video,
+    problem,
+)
+from factorsfm.frames.damage import Numbers, warn_if_short
 from factorsfm.frames.fields import CombWatch, Fields, FieldSplitter, blended, is_top_first, show_one_moment
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.picture import Orientation, Picture
@@ -33,7 +39,6 @@ _SEEK_FROM = 100  # frames: decoding fewer is faster than reading the packets of
 _LEADS = (0, _SEEK_FROM)  # frames before the wanted one to jump to: TS and MPG lead past its keyframe
 _COMPARED = 16  # frames at the start of the file whose timestamps must be those of its packets
 _PROBED = 26  # frames of a file from which fields, their order and their moments are read
-_ANNOUNCED_SHARE = 0.95  # of the frames that the container announces, which is not exact
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +50,7 @@ class VideoFile:
         interval: seconds from a frame to the next as the container announces it, 0 if unknown.
         orientation: how images are turned upright.
         pixel_aspect: width of a shown pixel over its height.
-        announced: frames that the container announces, 0 if it does not say.
+        announced, announced_seconds: frames and length that the container announces, 0 if it does not say.
         interlaced: whether its frames hold fields of two moments; film: whether they are flagged so, but hold one.
         top_first: whether the field of the lines 0, 2, 4, ... is the earlier one.
     """
@@ -56,6 +61,7 @@ class VideoFile:
     orientation: Orientation
     pixel_aspect: float
     announced: int
+    announced_seconds: float
     interlaced: bool
     film: bool
     top_first: bool
@@ -90,6 +96,7 @@ def open_video(path: Path) -> VideoFile:
             orientation=orientation,
             pixel_aspect=1.0 / aspect if orientation.turned else aspect,
             announced=stream.frames,
+            announced_seconds=announced_seconds(container, stream),
             interlaced=bool(flagged) and not film,
             film=film,
             top_first=top_first,
@@ -116,10 +123,11 @@ def decode(video: VideoFile, selection: slice, fields: Fields = "auto") -> Itera
     convert = _Converter(video, fields, FieldSplitter(video.top_first) if apart else None)
     watch = CombWatch() if fields == "auto" and not (video.interlaced or video.film) else None
     size = video.path.stat().st_size
-    position = -1
-    for position, frame in _from(video, chosen.first_frame):
+    numbers = Numbers(video.interval)
+    position, frame = -1, None
+    for position, frame in numbers.of(*_from(video, chosen.first_frame)):
         if chosen.is_over(position):
-            return
+            break
         if watch is not None and watch.push(frame):
             raise InputError(
                 f"{video.path} is interlaced before frame {position}, but not at its beginning; "
@@ -128,8 +136,12 @@ def decode(video: VideoFile, selection: slice, fields: Fields = "auto") -> Itera
         wanted = chosen.of_frame(position)
         if wanted:
             yield from convert(frame, wanted)
-    _warn_if_grown(position + 1, size, video.path)
-    _warn_if_short(position + 1, video.announced, video.path)
+    else:
+        _warn_if_grown(position + 1, size, video.path)
+        if frame is not None:
+            end = (frame.time or 0.0) - (video.start or 0.0) + video.interval
+            warn_if_short(video.path, (position + 1, video.announced), (end, video.announced_seconds))
+    numbers.warn(video.path)
 
 
 def count_frames(path: Path) -> int:
@@ -195,16 +207,6 @@ class _Converter:
         return float(frame.duration * frame.time_base) if frame.duration and frame.time_base else self._video.interval
 
 
-def _warn_if_short(frames: int, announced: int, path: Path) -> None:
-    """Log a warning if a file has clearly fewer frames than its container announces."""
-    if frames < _ANNOUNCED_SHARE * announced - 1.0:
-        logger.warning(
-            "%s: only %d of the %d frames that the container announces can be read; the others are damaged, missing, "
-            "or hidden by an edit",
-            path, frames, announced,
-        )  # fmt: skip
-
-
 def _warn_if_grown(frames: int, size: int, path: Path) -> None:
     """Log a warning if a file has become longer while its frames were read; size: before that, bytes."""
     with suppress(OSError):
@@ -212,8 +214,8 @@ def _warn_if_grown(frames: int, size: int, path: Path) -> None:
             logger.warning("%s: more was written to it while it was read; its first %d frames are used", path, frames)
 
 
-def _from(video: VideoFile, position: int) -> Iterator[tuple[int, av.VideoFrame]]:
-    """Positions and frames, all, or from a late one on where that one is found without decoding all before it.
+def _from(video: VideoFile, position: int) -> tuple[int, Iterator[tuple[av.VideoFrame, bool]]]:
+    """Frames, and the number of the first: all, or from a late one on where it is found without decoding all before it.
 
     Neither the frame count of a container nor its index can be trusted. But the packets of the file hold the timestamps
     of all frames, which are read without decoding, and the timestamp of the frame that is reached identifies it.
@@ -222,24 +224,32 @@ def _from(video: VideoFile, position: int) -> Iterator[tuple[int, av.VideoFrame]
     status = video.path.stat()
     times = _frame_times(video.path, status.st_size, status.st_mtime_ns) if late else np.zeros(0, np.int64)
     for lead in _LEADS if position < len(times) else ():
-        with opened_video(video.path) as (container, stream):
-            frames = _reached(container, stream, int(times[position - lead]), int(times[position]))
-            if frames is not None:
-                yield from enumerate(frames, position)
+        frames = _frames(video.path, int(times[position - lead]), int(times[position]))
+        first = next(frames, None)
+        if first is not None:
+            return position, itertools.chain([first], frames)
+    return 0, _frames(video.path)
+
+
+def _frames(path: Path, aim: int | None = None, wanted: int = 0) -> Iterator[tuple[av.VideoFrame, bool]]:
+    """All frames, as `decoded_with_damage` gives them.
+
+    Args:
+        aim, wanted: timestamps: those from `wanted` on, after a jump to `aim`; none if it is not found so.
+    """
+    with opened_video(path) as (container, stream):
+        frames = decoded_with_damage(container, stream)
+        if aim is not None:
+            try:
+                container.seek(aim, stream=stream)
+            except FFmpegError:
                 return
-    with opened_video(video.path) as (container, stream):
-        yield from enumerate(decoded(container, stream))
-
-
-def _reached(container: InputContainer, stream: VideoStream, aim: int, wanted: int) -> Iterator[av.VideoFrame] | None:
-    """Frames from that with the wanted timestamp on, after a jump to `aim`; None if it is not found so."""
-    try:
-        container.seek(aim, stream=stream)
-    except FFmpegError:
-        return None
-    frames = decoded(container, stream)
-    first = next((frame for frame in frames if frame.pts is not None and frame.pts >= wanted), None)
-    return itertools.chain([first], frames) if first is not None and first.pts == wanted else None
+            frames = itertools.dropwhile(lambda found: found[0].pts is None or found[0].pts < wanted, frames)
+            first = next(frames, None)
+            if first is None or first[0].pts != wanted or first[0].is_corrupt:
+                return
+            yield first
+        yield from frames
 
 
 @lru_cache(8)
@@ -247,13 +257,13 @@ def _frame_times(path: Path, size: int, modified_ns: int) -> NDArray[np.int64]:
     """Timestamps of all frames of a file in its own unit, from its packets; empty if they do not identify the frames.
 
     They do not if two are equal, or if an edit list hides packets, so that the first decoded frames have other
-    timestamps.
+    timestamps, or if packets are damaged or missing.
 
     Args:
         size, modified_ns: of the file now; a file that changes is read again.
     """
     with opened_video(path) as (container, stream):
-        packets = [packet.pts for packet in container.demux(stream) if packet.size]
+        packets = [None if packet.is_corrupt else packet.pts for packet in container.demux(stream) if packet.size]
     with opened_video(path) as (container, stream):
         first = [frame.pts for frame in itertools.islice(decoded(container, stream), _COMPARED)]
     if any(time is None for time in (*packets, *first)):

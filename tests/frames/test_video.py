@@ -81,6 +81,86 @@ def test_damage_inside_a_file_says_nothing_on_standard_error(tmp_path, capfd):
     assert capfd.readouterr().err == ""
 
 
+def with_broken_packet(path: Path, number: int) -> Path:
+    """The same file with zeros in the middle of a packet."""
+    with av.open(str(path)) as container:
+        packets = [(packet.pos, packet.size) for packet in container.demux(video=0) if packet.size]
+    position, size = packets[number]
+    data = bytearray(path.read_bytes())
+    data[position + size // 3 : position + 2 * (size // 3)] = bytes(size // 3)
+    path.write_bytes(data)
+    return path
+
+
+def test_a_frame_that_is_broken_leaves_its_number_free(tmp_path, caplog):
+    images = moving_texture(40)
+    options = {"g": "1", "x264-params": "keyint=1"}
+    path = with_broken_packet(write_video(tmp_path / "shot.mp4", images, options=options), 20)
+    frames = list(read_frames(path))
+    assert [frame.index for frame in frames] == [*range(20), *range(21, 40)]
+    for frame in frames:
+        assert frame.timestamp == pytest.approx(frame.index / 25, abs=1e-3)
+        assert np.abs(grey(frame.image) - grey(images[frame.index])).mean() < 3.0
+    assert caplog.messages == [f"{path} is damaged; frames that cannot be read: 1 (20); the others keep their numbers"]
+    assert [frame.index for frame in read_frames(path, slice(18, 24))] == [18, 19, 21, 22, 23]
+
+
+def test_a_hole_in_a_stream_leaves_numbers_free_and_corrupt_frames_out(tmp_path, caplog):
+    images = moving_texture(130, size=(160, 120))
+    path = write_video(tmp_path / "shot.ts", images, options={"g": "12"})
+    data = bytearray(path.read_bytes())
+    middle = len(data) // 2 // 188 * 188
+    data[middle : middle + 30 * 188] = bytes(30 * 188)
+    path.write_bytes(data)
+    frames = list(read_frames(path))
+    missing = sorted(set(range(130)) - {frame.index for frame in frames})
+    assert 1 < len(missing) < 40
+    assert frames[-1].index == 129
+    assert [frame.timestamp for frame in frames] == pytest.approx([frame.index / 25 for frame in frames], abs=1e-3)
+    for frame in frames[-40:]:  # behind the next keyframe
+        assert np.abs(grey(frame.image) - grey(images[frame.index])).mean() < 4.0
+    assert f"frames that cannot be read: {len(missing)} ({missing[0]}, " in caplog.text
+    late = list(read_frames(path, slice(120, None)))
+    assert [frame.index for frame in late] == list(range(120, 130))
+
+
+def test_uneven_frames_are_counted_one_by_one_beside_damage(tmp_path):
+    times = [0, 4, 8, 12, 20, 28, *range(36, 76, 4)]
+    path = write_video(tmp_path / "shot.mkv", moving_texture(16), times=times, options={"x264-params": "keyint=1"})
+    assert [frame.index for frame in read_frames(with_broken_packet(path, 8))] == list(range(15))
+
+
+def test_a_file_that_was_cut_off_says_how_much_of_it_is_missing(tmp_path, caplog):
+    path = write_video(tmp_path / "shot.mkv", moving_texture(60), options={"g": "5"})
+    assert len(list(read_frames(path))) == 60
+    assert not caplog.messages
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    read = len(list(read_frames(path)))
+    assert f"shot.mkv: only {read / 25:.1f} of the 2.4 seconds that the container announces" in caplog.text
+
+
+def test_all_frames_before_the_cut_of_a_file_are_read(tmp_path):
+    path = tmp_path / "shot.mp4"
+    write_video(tmp_path / "whole.mp4", moving_texture(40))
+    remux(tmp_path / "whole.mp4", path, {"movflags": "faststart"})
+    with av.open(str(path)) as container:
+        packets = [packet for packet in container.demux(video=0) if packet.size]
+    path.write_bytes(path.read_bytes()[: packets[25].pos + packets[25].size // 2])
+    with av.open(str(path)) as container:
+        container.streams.video[0].thread_type = "NONE"
+        expected = sum(len(p.decode()) for p in container.demux(video=0) if not p.is_corrupt)
+    assert len(list(read_frames(path))) == expected
+
+
+def remux(source: Path, target: Path, options: dict[str, str]) -> None:
+    with av.open(str(source)) as old, av.open(str(target), "w", options=options) as new:
+        stream = new.add_stream_from_template(old.streams.video[0])
+        for packet in old.demux(video=0):
+            if packet.size:
+                packet.stream = stream
+                new.mux(packet)
+
+
 def test_uneven_times_are_kept(tmp_path):
     times = [0, 4, 8, 12, 20, 28, 36]
     path = write_video(tmp_path / "shot.mkv", moving_texture(7), **LOSSLESS, times=times)
@@ -103,7 +183,7 @@ def test_a_late_range_holds_the_frames_that_it_names(tmp_path, suffix, codec):
 
 def test_a_late_range_that_no_jump_finds_is_decoded_from_the_start(tmp_path, monkeypatch):
     path = write_video(tmp_path / "shot.mkv", moving_texture(110, size=(160, 120)))
-    monkeypatch.setattr("factorsfm.frames.video._reached", lambda *_: None)
+    monkeypatch.setattr("factorsfm.frames.video._LEADS", ())
     assert [frame.index for frame in read_frames(path, slice(104, 107))] == [104, 105, 106]
 
 
@@ -129,7 +209,7 @@ def test_a_file_that_vanishes_with_its_network_is_no_shorter_file(tmp_path, monk
     frames = read_frames(path)
     next(frames)
 
-    def fail(_: object) -> None:
+    def fail(*_: object) -> None:
         raise av.error.OSError(5, "Input/output error")
 
     monkeypatch.setattr("factorsfm.frames.container._packet_frames", fail)
