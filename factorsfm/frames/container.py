@@ -13,6 +13,7 @@ import av
 import av.logging
 from av.container import InputContainer
 from av.error import FFmpegError, InvalidDataError
+from av.stream import Disposition, Stream
 from av.video.codeccontext import VideoCodecContext
 from av.video.stream import VideoStream
 
@@ -20,13 +21,15 @@ from factorsfm.support.errors import InputError
 
 _FILE = "file:"  # the protocol before a path, without which FFmpeg takes some paths for others
 
+_TEXT = ("ansi", "bintext", "idf", "xbin")  # codecs by which FFmpeg draws text as a picture
+
 
 @contextmanager
 def opened_video(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
-    """The container and its video. A file that names others, as a playlist does, can name none of a network.
+    """The container and its best video stream, never a cover. A file that names others can name none of a network.
 
     Raises:
-        InputError: it is no container, or holds no video.
+        InputError: it is no container, text, a single image, or holds no video.
     """
     try:
         container = av.open(f"{_FILE}{path}", options={"protocol_whitelist": "file"})
@@ -35,12 +38,30 @@ def opened_video(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
             f"{path} cannot be decoded as a video; it is damaged, still being written, or not a video"
         ) from error
     with container:
-        if not container.streams.video:
+        if _is_image(container):
+            raise InputError(f"{path} is a single image; a video file or a folder of images is expected")
+        stream = container.streams.best("video")
+        if stream is None or _is_cover(stream):
             raise InputError(f"{path} cannot be decoded as a video; it holds no picture")
-        stream = container.streams.video[0]
+        assert isinstance(stream, VideoStream)
         if has_decoder(stream):
+            if stream.codec_context.name in _TEXT:
+                raise InputError(f"{path} cannot be decoded as a video; it is text")
             stream.thread_type = "AUTO"
         yield container, stream
+
+
+def _is_image(container: InputContainer) -> bool:
+    return container.format.name == "image2" or container.format.name.endswith("_pipe")
+
+
+def _is_cover(stream: Stream) -> bool:
+    return bool(stream.disposition & Disposition.attached_pic)
+
+
+def video_streams(container: InputContainer) -> list[VideoStream]:
+    """All video of a file, without covers."""
+    return [stream for stream in container.streams.video if not _is_cover(stream)]
 
 
 def decoded(container: InputContainer, stream: VideoStream) -> Iterator[av.VideoFrame]:

@@ -22,6 +22,7 @@ from factorsfm.frames.container import (
     has_decoder,
     opened_video,
     problem,
+    video_streams,
 )
 from factorsfm.frames.damage import Numbers, warn_if_short
 from factorsfm.frames.fields import CombWatch, Fields, FieldSplitter, blended, is_top_first, show_one_moment
@@ -74,6 +75,10 @@ def open_video(path: Path) -> VideoFile:
         InputError: the file is not a video, or cannot be decoded.
     """
     with opened_video(path) as (container, stream):
+        several = len(video_streams(container))
+        if several > 1:
+            size = f"{stream.width}x{stream.height} pixels"
+            logger.warning("%s holds %d videos; stream %d is used, of %s", path, several, stream.index, size)
         frames = decoded(container, stream) if has_decoder(stream) else iter(())
         first = next(frames, None)
         if first is None:

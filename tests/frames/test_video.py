@@ -7,6 +7,7 @@ import av
 import cv2
 import numpy as np
 import pytest
+from av.stream import Disposition
 
 from factorsfm.frames.ranges import parse_range
 from factorsfm.frames.reading import read_frames
@@ -70,6 +71,62 @@ def test_a_file_without_picture_is_refused(tmp_path):
         container.mux(stream.encode(None))
     with pytest.raises(InputError, match=r"sound\.mp4 .* holds no picture"):
         read_frames(tmp_path / "sound.mp4")
+
+
+@pytest.mark.parametrize("name", ["notes.txt", "shot.nfo", "notes.mov"])
+def test_text_is_refused(tmp_path, name):
+    (tmp_path / name).write_text("Shot notes: take 3, 35 mm, T2.8\n" * 50)
+    with pytest.raises(InputError, match=r"cannot be decoded as a video"):
+        read_frames(tmp_path / name)
+
+
+def test_an_image_of_another_kind_is_refused(tmp_path):
+    cv2.imwrite(str(tmp_path / "shot.jp2"), moving_texture(1)[0])
+    with pytest.raises(InputError, match=r"shot\.jp2 is a single image; a video file or a folder of images"):
+        read_frames(tmp_path / "shot.jp2")
+
+
+def with_streams(path: Path, streams: list[tuple[list[np.ndarray], str, Disposition]], *, sound: bool = False) -> Path:
+    """A file of several videos, one behind the other: images, codec and disposition of each."""
+    with av.open(str(path), "w") as container:
+        added = [container.add_stream("aac", rate=48000)] if sound else []
+        for images, codec, disposition in streams:
+            stream = container.add_stream(codec, rate=25)
+            stream.height, stream.width = images[0].shape[:2]
+            stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
+            stream.disposition = disposition
+            added.append(stream)
+        if sound:
+            silence = av.AudioFrame.from_ndarray(np.zeros((2, 1024), np.float32), format="fltp", layout="stereo")
+            silence.sample_rate = 48000
+            container.mux([*added[0].encode(silence), *added[0].encode(None)])
+        for stream, (images, _, _) in zip(added[-len(streams) :], streams, strict=True):
+            for image in images:
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
+            container.mux(stream.encode(None))
+    return path
+
+
+def test_sound_with_a_cover_is_refused(tmp_path):
+    cover = (moving_texture(1), "mjpeg", Disposition.attached_pic)
+    path = with_streams(tmp_path / "song.mp4", [cover], sound=True)
+    with pytest.raises(InputError, match=r"song\.mp4 .* holds no picture"):
+        read_frames(path)
+
+
+def test_the_best_of_several_videos_is_read_and_named(tmp_path, caplog):
+    proxy = (moving_texture(12, size=(160, 120)), "libx264", Disposition(0))
+    whole = (moving_texture(12), "libx264", Disposition.default)
+    path = with_streams(tmp_path / "shot.mkv", [proxy, whole])
+    assert [frame.image.shape for frame in read_frames(path)] == [(240, 320, 3)] * 12
+    assert caplog.messages == [f"{path} holds 2 videos; stream 1 is used, of 320x240 pixels"]
+
+
+def test_a_cover_in_front_of_a_video_is_not_read(tmp_path, caplog):
+    cover = (moving_texture(1, size=(160, 120)), "mjpeg", Disposition.attached_pic)
+    path = with_streams(tmp_path / "shot.mp4", [cover, (moving_texture(12), "libx264", Disposition.default)])
+    assert [frame.image.shape for frame in read_frames(path)] == [(240, 320, 3)] * 12
+    assert not caplog.messages
 
 
 def test_damage_inside_a_file_says_nothing_on_standard_error(tmp_path, capfd):
