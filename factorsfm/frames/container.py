@@ -145,13 +145,15 @@ def has_decoder(stream: VideoStream) -> bool:
 
 def _unknown_codec(path: Path) -> str:
     """Name or tag of a codec without decoder, which FFmpeg says in its log alone."""
-    level = av.logging.get_level()
+    level, once = av.logging.get_level(), av.logging.get_skip_repeated()
     av.logging.set_level(av.logging.WARNING)
+    av.logging.set_skip_repeated(False)  # another file may have said the same
     try:
         with av.logging.Capture() as log, opened_video(path):
             said = " ".join(message for _, _, message in log)
     finally:
         av.logging.set_level(level)
+        av.logging.set_skip_repeated(once)
     found = re.search(r"Video: (\w+)(?: \((\w+) /)?", said)
     if found is None:
         return "unknown"

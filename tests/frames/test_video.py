@@ -57,8 +57,9 @@ def test_av1(tmp_path, capfd):
 def test_a_codec_without_decoder_is_named(tmp_path, capfd):
     path = write_video(tmp_path / "shot.avi", moving_texture(3), "mjpeg", "yuvj420p")
     path.write_bytes(path.read_bytes().replace(b"MJPG", b"XYZW"))
-    with pytest.raises(InputError, match=r"shot\.avi .* no decoder for its codec \(XYZW\); convert it to H\.264"):
-        read_frames(path)
+    for _ in range(2):  # of each file, though FFmpeg says it once
+        with pytest.raises(InputError, match=r"shot\.avi .* no decoder for its codec \(XYZW\); convert it to H\.264"):
+            read_frames(path)
     assert capfd.readouterr().err == ""
 
 
