@@ -29,6 +29,8 @@ from factorsfm.support.similarity import Similarity
 from factorsfm.support.up_axis import FILM_CAMERA, TURNED_WORLD, UpAxis
 
 _DEFAULT_FPS = 24.0
+_MOST_ROUNDING = 0.01  # relative: neighbouring film rates differ by four times as much
+_EVEN = 0.2  # of the usual step: containers round times
 _FRAME_RATES = (24000 / 1001, 24.0, 25.0, 30000 / 1001, 30.0, 48.0, 50.0, 60000 / 1001, 60.0)
 
 
@@ -284,20 +286,24 @@ def first_frame_of(first_number: int | None, first_frame: int | None, defaults: 
 
 
 def _source_fps(frames: list[FrameResult]) -> float | None:
-    """The frame rate from the timestamps, rounded to a standard rate that is very near."""
-    timed = [frame for frame in frames if frame.timestamp is not None]
+    """The frame rate from the timestamps, rounded to a standard rate that is very near.
+
+    It is that of the usual steps: pauses, frames that were left out and times that jump back have no part in it.
+    """
+    timed = [(frame.index, frame.timestamp) for frame in frames if frame.timestamp is not None]
     if len(timed) < 2:
         return None
-    first, last = timed[0], timed[-1]
-    assert first.timestamp is not None
-    assert last.timestamp is not None
-    seconds = last.timestamp - first.timestamp
-    if not seconds > 0:
+    gaps, steps = np.diff(np.array(timed, np.float64), axis=0).T
+    interval = np.quantile(steps / gaps, 0.5, method="lower")
+    if not interval > 0:
         return None
-    fps = (last.index - first.index) / seconds
+    even = np.abs(steps / gaps / interval - 1.0) < _EVEN
+    seconds = float(steps[even].sum())
+    fps = float(gaps[even].sum()) / seconds
+    # Timestamps are often rounded to milliseconds: at the ends, and around each step that is left out.
+    rounding = min(1e-3 * (1 + np.count_nonzero(~even)) / seconds, _MOST_ROUNDING)
     usual = min(_FRAME_RATES, key=lambda rate: abs(rate - fps))
-    # Timestamps are often rounded to milliseconds.
-    return usual if math.isclose(usual, fps, rel_tol=max(1e-4, 1e-3 / seconds)) else fps
+    return usual if math.isclose(usual, fps, rel_tol=max(1e-4, rounding)) else fps
 
 
 def _source(reconstruction: Reconstruction) -> Path | None:

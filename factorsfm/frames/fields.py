@@ -23,7 +23,11 @@ Fields = Literal["auto", "apart", "blend"]
 # weights of the four nearest lines for a point a quarter of a line below the second.
 _QUARTER = np.array([-0.0703125, 0.8671875, 0.2265625, -0.0234375])
 _BLEND = np.array([0.25, 0.5, 0.25])  # a line of one field, and the mean of its neighbours of the other
-_ONE_MOMENT = 0.5  # of the difference to the next frame: two moments at even steps have 1, a still shot, too
+_ONE_MOMENT = 0.25  # mean moment of the later fields, in frames: 0 of film, 0.5 of two moments at even steps
+# Few pairs of frames tell less, and a video is refused by them: 4 pairs at least, and 24 at most.
+_TWO_MOMENTS, _TELLING, _WATCHED = 0.35, 4, 24
+_STRONGEST = 0.99  # quantile of the motion from which pixels tell moments: grain and compression move the others
+_STILL = 3.0  # grey levels: grain and compression make as much
 
 
 class FieldSplitter:
@@ -101,24 +105,54 @@ def _first_field(frame: av.VideoFrame) -> NDArray[np.int16]:
 def show_one_moment(frames: Sequence[av.VideoFrame], *, top_first: bool) -> bool:
     """Whether the fields of interlaced frames are of one moment each, as where film is stored as interlaced video.
 
-    The later field then is much nearer to the earlier one of its own frame than to that of the next frame. In a still
-    shot it is as near to both, and the frames count as interlaced.
+    The later field of a frame is then of the moment of the earlier one; else it lies in the middle between this and
+    that of the next frame. A still shot does not tell, and its frames count as interlaced.
     """
-    first, second = (0, 1) if top_first else (1, 0)
-    own = to_next = 0.0
-    lumas = [_luma(frame).astype(np.float32) for frame in frames]
-    for luma, following in itertools.pairwise(lumas):
-        later = _between(luma, second)
-        own += float(np.abs(later - luma[first::2][1 : 1 + len(later)]).mean())
-        to_next += float(np.abs(later - following[first::2][1 : 1 + len(later)]).mean())
-    return own < _ONE_MOMENT * to_next
+    pairs = [pair for pair in itertools.pairwise(frames) if pair[0].interlaced_frame]
+    moments = [_moment(*pair, top_first=top_first) for pair in pairs]
+    told = [moment for moment in moments if moment is not None]
+    return bool(told) and float(np.mean(told)) < _ONE_MOMENT
 
 
-def _between(luma: NDArray[np.float32], parity: int) -> NDArray[np.float32]:
-    """One field, averaged to the lines of the other one from its second on."""
-    lines = luma[parity::2]
-    means = 0.5 * (lines[:-1] + lines[1:])
-    return means[:-1] if parity == 1 else means[1:]
+class CombWatch:
+    """Watches for frames of two moments in a video that began without frames flagged as interlaced."""
+
+    def __init__(self) -> None:
+        self._before: av.VideoFrame | None = None
+        self._told: list[float] = []
+
+    def push(self, frame: av.VideoFrame) -> bool:
+        """Whether the frames up to the next one have shown that flagged ones among them hold two moments."""
+        before, self._before = self._before, frame if frame.interlaced_frame else None
+        if before is not None and len(self._told) < _WATCHED and before.format.name == frame.format.name:
+            moment = _moment(before, frame, top_first=is_top_first([before], 0))
+            self._told += [] if moment is None else [moment]
+        return len(self._told) >= _TELLING and float(np.mean(self._told)) > _TWO_MOMENTS
+
+
+def _moment(frame: av.VideoFrame, following: av.VideoFrame, *, top_first: bool) -> float | None:
+    """When the later field of a frame was seen: 0 with its earlier field, 1 with that of the next frame.
+
+    The difference between the two earlier fields, which have the same lines, is motion alone. The share of it that the
+    later field has gone through is found by least squares: what its other lines show besides, the vertical detail of
+    the picture, is as near to both and does not count.
+
+    Returns:
+        0 to 1; None where nothing moves.
+    """
+    luma, luma_after = (_luma(image).astype(np.float32) for image in (frame, following))
+    first = 0 if top_first else 1  # line of the earlier fields
+    before, after = (0.5 * (lines[first::2][:-1] + lines[first::2][1:]) for lines in (luma, luma_after))
+    later = luma[1 - first :: 2][first:][: len(before)]
+    before, after = before[: len(later)], after[: len(later)]
+    motion = after - before
+    strength = np.abs(motion)
+    least = float(np.quantile(strength, _STRONGEST))
+    if least < _STILL:
+        return None
+    moved = strength >= least
+    share = float((motion * (later - before))[moved].sum() / (motion[moved] ** 2).sum())
+    return min(max(share, 0.0), 1.0)
 
 
 def _luma(frame: av.VideoFrame) -> Image:

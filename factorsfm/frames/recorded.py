@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol, TypeVar
@@ -126,6 +127,12 @@ class RecordedFootage:
                 f"Frames come at uneven times, {1e3 * steps.min():.0f} to {1e3 * steps.max():.0f} ms after one "
                 "another: exports at a constant rate show each as long as any other."
             )
+        back = _jumps_back(frames)
+        if back:
+            notes.append(
+                f"Times of frames do not rise, before frame {first_few(back, _MOST_NOTED)}: all frames count as "
+                "recorded evenly. The file may be several recordings, one behind another."
+            )
         return notes
 
     def _repeats_said(self, rhythm: tuple[int, int] | None, interval: float) -> str:
@@ -138,6 +145,12 @@ class RecordedFootage:
         if new == period - 1:
             return f"Every {_ordinal(period)}frame repeats the one before{rates}."
         return f"Of every {period} frames {period - new} repeat the one before{rates}."
+
+
+def _jumps_back(frames: Sequence[_Timed]) -> list[int]:
+    """Numbers of the frames that are not later than the one before."""
+    timed = [(frame.index, frame.timestamp) for frame in frames if frame.timestamp is not None]
+    return [index for (_, before), (index, time) in itertools.pairwise(timed) if time <= before]
 
 
 def _ordinal(number: int) -> str:

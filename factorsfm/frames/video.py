@@ -4,24 +4,28 @@ from __future__ import annotations
 
 import itertools
 import logging
-import re
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import cast
 
 import av
-import av.logging
 import numpy as np
-from av.container import InputContainer
-from av.error import FFmpegError, InvalidDataError
-from av.video.codeccontext import VideoCodecContext
-from av.video.stream import VideoStream
+from av.error import FFmpegError
 from numpy.typing import NDArray
 
-from factorsfm.frames.fields import Fields, FieldSplitter, blended, is_top_first, show_one_moment
+from factorsfm.frames.container import (
+    announced_seconds,
+    decoded,
+    decoded_with_damage,
+    has_decoder,
+    opened_video,
+    problem,
+    video_streams,
+)
+from factorsfm.frames.damage import Numbers, warn_if_short
+from factorsfm.frames.fields import CombWatch, Fields, FieldSplitter, blended, is_top_first, show_one_moment
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.picture import Orientation, Picture
 from factorsfm.support.errors import InputError
@@ -33,10 +37,9 @@ VIDEO_SUFFIXES = (
     *(".mpg", ".mts", ".mxf", ".ogv", ".ts", ".webm", ".wmv"),
 )
 _SEEK_FROM = 100  # frames: decoding fewer is faster than reading the packets of the whole file
+_LEADS = (0, _SEEK_FROM)  # frames before the wanted one to jump to: TS and MPG lead past its keyframe
 _COMPARED = 16  # frames at the start of the file whose timestamps must be those of its packets
-_PROBED = 24  # frames of an interlaced file from which the order and the moments of its fields are read
-_FILE = "file:"  # the protocol before a path, without which FFmpeg takes some paths for others
-_ANNOUNCED_SHARE = 0.95  # of the frames that the container announces, which is not exact
+_PROBED = 26  # frames of a file from which fields, their order and their moments are read
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +51,9 @@ class VideoFile:
         interval: seconds from a frame to the next as the container announces it, 0 if unknown.
         orientation: how images are turned upright.
         pixel_aspect: width of a shown pixel over its height.
-        interlaced: whether its frames hold fields of two moments; top_first: which of them is the earlier one.
+        announced, announced_seconds: frames and length that the container announces, 0 if it does not say.
+        interlaced: whether its frames hold fields of two moments; film: whether they are flagged so, but hold one.
+        top_first: whether the field of the lines 0, 2, 4, ... is the earlier one.
     """
 
     path: Path
@@ -56,7 +61,10 @@ class VideoFile:
     interval: float
     orientation: Orientation
     pixel_aspect: float
+    announced: int
+    announced_seconds: float
     interlaced: bool
+    film: bool
     top_first: bool
 
 
@@ -66,31 +74,36 @@ def open_video(path: Path) -> VideoFile:
     Raises:
         InputError: the file is not a video, or cannot be decoded.
     """
-    with _opened(path) as (container, stream):
-        frames = _decoded(container, stream) if _has_decoder(stream) else iter(())
+    with opened_video(path) as (container, stream):
+        several = len(video_streams(container))
+        if several > 1:
+            size = f"{stream.width}x{stream.height} pixels"
+            logger.warning("%s holds %d videos; stream %d is used, of %s", path, several, stream.index, size)
+        frames = decoded(container, stream) if has_decoder(stream) else iter(())
         first = next(frames, None)
         if first is None:
-            raise InputError(f"{path} cannot be decoded as a video; {_problem(path, stream)}")
+            raise InputError(f"{path} cannot be decoded as a video; {problem(path, stream)}")
         second = next(frames, None)
         timed = first.time is not None and second is not None and (second.time or 0.0) > first.time
         orientation = Orientation.of(first)
         aspect = float(stream.sample_aspect_ratio or 1) or 1.0
         order = int(stream.codec_context.field_order or 0)
-        probed = [first, *([] if second is None else [second])]
-        interlaced = any(frame.interlaced_frame for frame in probed)
-        if interlaced:
-            probed += itertools.islice(frames, _PROBED)
-        top_first = not interlaced or is_top_first(probed, order)
-        if interlaced and show_one_moment(probed, top_first=top_first):
+        probed = [first, *([] if second is None else [second]), *itertools.islice(frames, _PROBED - 2)]
+        flagged = [frame for frame in probed if frame.interlaced_frame]
+        top_first = not flagged or is_top_first(flagged, order)
+        film = bool(flagged) and show_one_moment(probed, top_first=top_first)
+        if film:
             logger.info("%s is interlaced, but both fields of a frame show one moment: frames stay whole", path)
-            interlaced = False
         return VideoFile(
             path=path,
             start=first.time if timed else None,
             interval=float(1 / stream.guessed_rate) if stream.guessed_rate else 0.0,
             orientation=orientation,
             pixel_aspect=1.0 / aspect if orientation.turned else aspect,
-            interlaced=interlaced,
+            announced=stream.frames,
+            announced_seconds=announced_seconds(container, stream),
+            interlaced=bool(flagged) and not film,
+            film=film,
             top_first=top_first,
         )
 
@@ -107,27 +120,33 @@ def decode(video: VideoFile, selection: slice, fields: Fields = "auto") -> Itera
             case.
 
     Raises:
-        InputError: the file cannot be opened or read any more.
+        InputError: the file cannot be opened or read any more, or interlaced frames come after others.
     """
     apart = fields == "apart" or (fields == "auto" and video.interlaced)
     per_frame = 2 if apart else 1
     chosen = _Chosen(selection, per_frame)
     convert = _Converter(video, fields, FieldSplitter(video.top_first) if apart else None)
-    with _opened(video.path) as (container, stream):
-        frames = _from(container, stream, video, chosen.first_frame)
-        if frames is None:
-            container.seek(0, stream=stream)
-            frames = enumerate(_decoded(container, stream))
-        size = video.path.stat().st_size
-        position = -1
-        for position, frame in frames:
-            if chosen.is_over(position):
-                return
-            wanted = chosen.of_frame(position)
-            if wanted:
-                yield from convert(frame, wanted)
+    watch = CombWatch() if fields == "auto" and not (video.interlaced or video.film) else None
+    size = video.path.stat().st_size
+    numbers = Numbers(video.interval)
+    position, frame = -1, None
+    for position, frame in numbers.of(*_from(video, chosen.first_frame)):
+        if chosen.is_over(position):
+            break
+        if watch is not None and watch.push(frame):
+            raise InputError(
+                f"{video.path} is interlaced before frame {position}, but not at its beginning; "
+                "fields apart or blend (--fields) is expected for such a video"
+            )
+        wanted = chosen.of_frame(position)
+        if wanted:
+            yield from convert(frame, wanted)
+    else:
         _warn_if_grown(position + 1, size, video.path)
-        _warn_if_short(position + 1, stream.frames, video.path)
+        if frame is not None:
+            end = (frame.time or 0.0) - (video.start or 0.0) + video.interval
+            warn_if_short(video.path, (position + 1, video.announced), (end, video.announced_seconds))
+    numbers.warn(video.path)
 
 
 def count_frames(path: Path) -> int:
@@ -136,8 +155,8 @@ def count_frames(path: Path) -> int:
     Raises:
         InputError: the file is not a video.
     """
-    with _opened(path) as (container, stream):
-        return sum(1 for _ in _decoded(container, stream))
+    with opened_video(path) as (container, stream):
+        return sum(1 for _ in decoded(container, stream))
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,93 +212,6 @@ class _Converter:
         return float(frame.duration * frame.time_base) if frame.duration and frame.time_base else self._video.interval
 
 
-@contextmanager
-def _opened(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
-    """The container and its video. A file that names others, as a playlist does, can name none of a network.
-
-    Raises:
-        InputError: it is no container, or holds no video.
-    """
-    try:
-        container = av.open(f"{_FILE}{path}", options={"protocol_whitelist": "file"})
-    except (FFmpegError, OSError, ValueError) as error:
-        raise InputError(
-            f"{path} cannot be decoded as a video; it is damaged, still being written, or not a video"
-        ) from error
-    with container:
-        if not container.streams.video:
-            raise InputError(f"{path} cannot be decoded as a video; it holds no picture")
-        stream = container.streams.video[0]
-        yield container, stream
-
-
-def _decoded(container: InputContainer, stream: VideoStream) -> Iterator[av.VideoFrame]:
-    """Frames from where the container stands. Damaged packets are left out, and a file may end inside of one.
-
-    Raises:
-        InputError: the file is gone, such as with the network that held it.
-    """
-    stream.thread_type = "AUTO"
-    packets = container.demux(stream)
-    while True:
-        try:
-            packet = next(packets, None)
-            if packet is None:
-                return
-            frames = _packet_frames(packet)
-        except InvalidDataError:
-            continue
-        except FFmpegError as error:
-            path = Path(container.name.removeprefix(_FILE))
-            try:
-                path.stat()
-            except OSError as gone:
-                raise InputError(f"{path} cannot be read any more: {gone.strerror}") from error
-            return
-        yield from frames
-
-
-def _packet_frames(packet: av.Packet[VideoStream]) -> list[av.VideoFrame]:
-    return packet.decode()
-
-
-def _problem(path: Path, stream: VideoStream) -> str:
-    """What is wrong with a file that gives no frame."""
-    cure = "convert it to H.264"
-    if _has_decoder(stream):
-        return f"its codec ({stream.codec_context.name}) finds no picture in it: it is damaged; {cure}"
-    return f"FFmpeg has no decoder for its codec ({_unknown_codec(path)}); {cure}"
-
-
-def _has_decoder(stream: VideoStream) -> bool:
-    return cast("VideoCodecContext | None", stream.codec_context) is not None
-
-
-def _unknown_codec(path: Path) -> str:
-    """Name or tag of a codec without decoder, which FFmpeg says in its log alone."""
-    level = av.logging.get_level()
-    av.logging.set_level(av.logging.WARNING)
-    try:
-        with av.logging.Capture() as log, _opened(path):
-            said = " ".join(message for _, _, message in log)
-    finally:
-        av.logging.set_level(level)
-    found = re.search(r"Video: (\w+)(?: \((\w+) /)?", said)
-    if found is None:
-        return "unknown"
-    return found[2] if found[1] == "none" and found[2] else found[1]
-
-
-def _warn_if_short(frames: int, announced: int, path: Path) -> None:
-    """Log a warning if a file has clearly fewer frames than its container announces."""
-    if frames < _ANNOUNCED_SHARE * announced - 1.0:
-        logger.warning(
-            "%s: only %d of the %d frames that the container announces can be read; the others are damaged, missing, "
-            "or hidden by an edit",
-            path, frames, announced,
-        )  # fmt: skip
-
-
 def _warn_if_grown(frames: int, size: int, path: Path) -> None:
     """Log a warning if a file has become longer while its frames were read; size: before that, bytes."""
     with suppress(OSError):
@@ -287,29 +219,42 @@ def _warn_if_grown(frames: int, size: int, path: Path) -> None:
             logger.warning("%s: more was written to it while it was read; its first %d frames are used", path, frames)
 
 
-def _from(
-    container: InputContainer, stream: VideoStream, video: VideoFile, position: int
-) -> Iterator[tuple[int, av.VideoFrame]] | None:
-    """Positions and frames, all or from a late one on; None if the late one was not found.
+def _from(video: VideoFile, position: int) -> tuple[int, Iterator[tuple[av.VideoFrame, bool]]]:
+    """Frames, and the number of the first: all, or from a late one on where it is found without decoding all before it.
 
     Neither the frame count of a container nor its index can be trusted. But the packets of the file hold the timestamps
     of all frames, which are read without decoding, and the timestamp of the frame that is reached identifies it.
     """
-    if video.start is None or position < _SEEK_FROM:
-        return enumerate(_decoded(container, stream))
+    late = video.start is not None and position >= _SEEK_FROM
     status = video.path.stat()
-    times = _frame_times(video.path, status.st_size, status.st_mtime_ns)
-    if position >= len(times):
-        return None
-    try:
-        container.seek(int(times[position]), stream=stream)
-    except FFmpegError:
-        return None
-    frames = _decoded(container, stream)
-    reached = next((frame for frame in frames if frame.pts is not None and frame.pts >= times[position]), None)
-    if reached is None or reached.pts != times[position]:
-        return None
-    return enumerate(itertools.chain([reached], frames), position)
+    times = _frame_times(video.path, status.st_size, status.st_mtime_ns) if late else np.zeros(0, np.int64)
+    for lead in _LEADS if position < len(times) else ():
+        frames = _frames(video.path, int(times[position - lead]), int(times[position]))
+        first = next(frames, None)
+        if first is not None:
+            return position, itertools.chain([first], frames)
+    return 0, _frames(video.path)
+
+
+def _frames(path: Path, aim: int | None = None, wanted: int = 0) -> Iterator[tuple[av.VideoFrame, bool]]:
+    """All frames, as `decoded_with_damage` gives them.
+
+    Args:
+        aim, wanted: timestamps: those from `wanted` on, after a jump to `aim`; none if it is not found so.
+    """
+    with opened_video(path) as (container, stream):
+        frames = decoded_with_damage(container, stream)
+        if aim is not None:
+            try:
+                container.seek(aim, stream=stream)
+            except FFmpegError:
+                return
+            frames = itertools.dropwhile(lambda found: found[0].pts is None or found[0].pts < wanted, frames)
+            first = next(frames, None)
+            if first is None or first[0].pts != wanted or first[0].is_corrupt:
+                return
+            yield first
+        yield from frames
 
 
 @lru_cache(8)
@@ -317,15 +262,15 @@ def _frame_times(path: Path, size: int, modified_ns: int) -> NDArray[np.int64]:
     """Timestamps of all frames of a file in its own unit, from its packets; empty if they do not identify the frames.
 
     They do not if two are equal, or if an edit list hides packets, so that the first decoded frames have other
-    timestamps.
+    timestamps, or if packets are damaged or missing.
 
     Args:
         size, modified_ns: of the file now; a file that changes is read again.
     """
-    with _opened(path) as (container, stream):
-        packets = [packet.pts for packet in container.demux(stream) if packet.size]
-    with _opened(path) as (container, stream):
-        first = [frame.pts for frame in itertools.islice(_decoded(container, stream), _COMPARED)]
+    with opened_video(path) as (container, stream):
+        packets = [None if packet.is_corrupt else packet.pts for packet in container.demux(stream) if packet.size]
+    with opened_video(path) as (container, stream):
+        first = [frame.pts for frame in itertools.islice(decoded(container, stream), _COMPARED)]
     if any(time is None for time in (*packets, *first)):
         return np.zeros(0, np.int64)
     times = np.sort(np.array(packets, np.int64))

@@ -707,6 +707,25 @@ def test_frame_rate_of_the_source(tmp_path: Path, rate: float, expected: float) 
     assert header["Units Per Second"] == "24"
 
 
+@pytest.mark.parametrize(
+    "moved_times",
+    [
+        lambda times: np.where(np.arange(len(times)) < len(times) // 2, times, times + 10.0),  # a pause
+        lambda times: np.where(np.arange(len(times)) < len(times) // 2, times, times - times[len(times) // 2]),
+        lambda times: np.where(np.arange(len(times)) < len(times) - 1, times, times + 1 / 24),  # one was left out
+    ],
+    ids=["pause", "jump back", "gap"],
+)
+def test_frame_rate_is_that_of_the_usual_steps(tmp_path: Path, moved_times: Callable[[Array], Array]) -> None:
+    reconstruction = hard_reconstruction()
+    times = moved_times(np.array([frame.index / 24 for frame in reconstruction.frames]))
+    for frame, time in zip(reconstruction.frames, times, strict=True):
+        frame.timestamp = round(float(time), 3)
+    export(reconstruction, tmp_path / "out", format="after-effects")
+    header, _ = after_effects_tracks((tmp_path / "out" / "camera.txt").read_text())
+    assert header["Units Per Second"] == "24"
+
+
 def test_import_is_light() -> None:
     """The command line does not wait for the extras' packages, nor for what plates alone need."""
     code = "import sys, factorsfm.cli; print([m for m in ('pxr', 'OpenEXR', 'alembic3d') if m in sys.modules])"

@@ -1,11 +1,13 @@
 """Video files as they come: codecs, containers, times, fields, pixel aspect, orientation and colour."""
 
 from fractions import Fraction
+from pathlib import Path
 
 import av
 import cv2
 import numpy as np
 import pytest
+from av.stream import Disposition
 
 from factorsfm.frames.ranges import parse_range
 from factorsfm.frames.reading import read_frames
@@ -55,8 +57,9 @@ def test_av1(tmp_path, capfd):
 def test_a_codec_without_decoder_is_named(tmp_path, capfd):
     path = write_video(tmp_path / "shot.avi", moving_texture(3), "mjpeg", "yuvj420p")
     path.write_bytes(path.read_bytes().replace(b"MJPG", b"XYZW"))
-    with pytest.raises(InputError, match=r"shot\.avi .* no decoder for its codec \(XYZW\); convert it to H\.264"):
-        read_frames(path)
+    for _ in range(2):  # of each file, though FFmpeg says it once
+        with pytest.raises(InputError, match=r"shot\.avi .* no decoder for its codec \(XYZW\); convert it to H\.264"):
+            read_frames(path)
     assert capfd.readouterr().err == ""
 
 
@@ -71,6 +74,62 @@ def test_a_file_without_picture_is_refused(tmp_path):
         read_frames(tmp_path / "sound.mp4")
 
 
+@pytest.mark.parametrize("name", ["notes.txt", "shot.nfo", "notes.mov"])
+def test_text_is_refused(tmp_path, name):
+    (tmp_path / name).write_text("Shot notes: take 3, 35 mm, T2.8\n" * 50)
+    with pytest.raises(InputError, match=r"cannot be decoded as a video"):
+        read_frames(tmp_path / name)
+
+
+def test_an_image_of_another_kind_is_refused(tmp_path):
+    cv2.imwrite(str(tmp_path / "shot.jp2"), moving_texture(1)[0])
+    with pytest.raises(InputError, match=r"shot\.jp2 is a single image; a video file or a folder of images"):
+        read_frames(tmp_path / "shot.jp2")
+
+
+def with_streams(path: Path, streams: list[tuple[list[np.ndarray], str, Disposition]], *, sound: bool = False) -> Path:
+    """A file of several videos, one behind the other: images, codec and disposition of each."""
+    with av.open(str(path), "w") as container:
+        added = [container.add_stream("aac", rate=48000)] if sound else []
+        for images, codec, disposition in streams:
+            stream = container.add_stream(codec, rate=25)
+            stream.height, stream.width = images[0].shape[:2]
+            stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
+            stream.disposition = disposition
+            added.append(stream)
+        if sound:
+            silence = av.AudioFrame.from_ndarray(np.zeros((2, 1024), np.float32), format="fltp", layout="stereo")
+            silence.sample_rate = 48000
+            container.mux([*added[0].encode(silence), *added[0].encode(None)])
+        for stream, (images, _, _) in zip(added[-len(streams) :], streams, strict=True):
+            for image in images:
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
+            container.mux(stream.encode(None))
+    return path
+
+
+def test_sound_with_a_cover_is_refused(tmp_path):
+    cover = (moving_texture(1), "mjpeg", Disposition.attached_pic)
+    path = with_streams(tmp_path / "song.mp4", [cover], sound=True)
+    with pytest.raises(InputError, match=r"song\.mp4 .* holds no picture"):
+        read_frames(path)
+
+
+def test_the_best_of_several_videos_is_read_and_named(tmp_path, caplog):
+    proxy = (moving_texture(12, size=(160, 120)), "libx264", Disposition(0))
+    whole = (moving_texture(12), "libx264", Disposition.default)
+    path = with_streams(tmp_path / "shot.mkv", [proxy, whole])
+    assert [frame.image.shape for frame in read_frames(path)] == [(240, 320, 3)] * 12
+    assert caplog.messages == [f"{path} holds 2 videos; stream 1 is used, of 320x240 pixels"]
+
+
+def test_a_cover_in_front_of_a_video_is_not_read(tmp_path, caplog):
+    cover = (moving_texture(1, size=(160, 120)), "mjpeg", Disposition.attached_pic)
+    path = with_streams(tmp_path / "shot.mp4", [cover, (moving_texture(12), "libx264", Disposition.default)])
+    assert [frame.image.shape for frame in read_frames(path)] == [(240, 320, 3)] * 12
+    assert not caplog.messages
+
+
 def test_damage_inside_a_file_says_nothing_on_standard_error(tmp_path, capfd):
     path = write_video(tmp_path / "shot.mp4", moving_texture(40))
     data = bytearray(path.read_bytes())
@@ -80,10 +139,110 @@ def test_damage_inside_a_file_says_nothing_on_standard_error(tmp_path, capfd):
     assert capfd.readouterr().err == ""
 
 
+def with_broken_packet(path: Path, number: int) -> Path:
+    """The same file with zeros in the middle of a packet."""
+    with av.open(str(path)) as container:
+        packets = [(packet.pos, packet.size) for packet in container.demux(video=0) if packet.size]
+    position, size = packets[number]
+    data = bytearray(path.read_bytes())
+    data[position + size // 3 : position + 2 * (size // 3)] = bytes(size // 3)
+    path.write_bytes(data)
+    return path
+
+
+def test_a_frame_that_is_broken_leaves_its_number_free(tmp_path, caplog):
+    images = moving_texture(40)
+    options = {"g": "1", "x264-params": "keyint=1"}
+    path = with_broken_packet(write_video(tmp_path / "shot.mp4", images, options=options), 20)
+    frames = list(read_frames(path))
+    assert [frame.index for frame in frames] == [*range(20), *range(21, 40)]
+    for frame in frames:
+        assert frame.timestamp == pytest.approx(frame.index / 25, abs=1e-3)
+        assert np.abs(grey(frame.image) - grey(images[frame.index])).mean() < 3.0
+    assert caplog.messages == [f"{path} is damaged; frames that cannot be read: 1 (20); the others keep their numbers"]
+    assert [frame.index for frame in read_frames(path, slice(18, 24))] == [18, 19, 21, 22, 23]
+
+
+def test_a_hole_in_a_stream_leaves_numbers_free_and_corrupt_frames_out(tmp_path, caplog):
+    images = moving_texture(130, size=(160, 120))
+    path = write_video(tmp_path / "shot.ts", images, options={"g": "12"})
+    data = bytearray(path.read_bytes())
+    middle = len(data) // 2 // 188 * 188
+    data[middle : middle + 30 * 188] = bytes(30 * 188)
+    path.write_bytes(data)
+    frames = list(read_frames(path))
+    missing = sorted(set(range(130)) - {frame.index for frame in frames})
+    assert 1 < len(missing) < 40
+    assert frames[-1].index == 129
+    assert [frame.timestamp for frame in frames] == pytest.approx([frame.index / 25 for frame in frames], abs=1e-3)
+    for frame in frames[-40:]:  # behind the next keyframe
+        assert np.abs(grey(frame.image) - grey(images[frame.index])).mean() < 4.0
+    assert f"frames that cannot be read: {len(missing)} ({missing[0]}, " in caplog.text
+    late = list(read_frames(path, slice(120, None)))
+    assert [frame.index for frame in late] == list(range(120, 130))
+
+
+def test_uneven_frames_are_counted_one_by_one_beside_damage(tmp_path):
+    times = [0, 4, 8, 12, 20, 28, *range(36, 76, 4)]
+    path = write_video(tmp_path / "shot.mkv", moving_texture(16), times=times, options={"x264-params": "keyint=1"})
+    assert [frame.index for frame in read_frames(with_broken_packet(path, 8))] == list(range(15))
+
+
+def test_a_file_that_was_cut_off_says_how_much_of_it_is_missing(tmp_path, caplog):
+    path = write_video(tmp_path / "shot.mkv", moving_texture(60), options={"g": "5"})
+    assert len(list(read_frames(path))) == 60
+    assert not caplog.messages
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    read = len(list(read_frames(path)))
+    assert f"shot.mkv: only {read / 25:.1f} of the 2.4 seconds that the container announces" in caplog.text
+
+
+def test_all_frames_before_the_cut_of_a_file_are_read(tmp_path):
+    path = tmp_path / "shot.mp4"
+    write_video(tmp_path / "whole.mp4", moving_texture(40))
+    remux(tmp_path / "whole.mp4", path, {"movflags": "faststart"})
+    with av.open(str(path)) as container:
+        packets = [packet for packet in container.demux(video=0) if packet.size]
+    path.write_bytes(path.read_bytes()[: packets[25].pos + packets[25].size // 2])
+    with av.open(str(path)) as container:
+        container.streams.video[0].thread_type = "NONE"
+        expected = sum(len(p.decode()) for p in container.demux(video=0) if not p.is_corrupt)
+    assert len(list(read_frames(path))) == expected
+
+
+def remux(source: Path, target: Path, options: dict[str, str]) -> None:
+    with av.open(str(source)) as old, av.open(str(target), "w", options=options) as new:
+        stream = new.add_stream_from_template(old.streams.video[0])
+        for packet in old.demux(video=0):
+            if packet.size:
+                packet.stream = stream
+                new.mux(packet)
+
+
 def test_uneven_times_are_kept(tmp_path):
     times = [0, 4, 8, 12, 20, 28, 36]
     path = write_video(tmp_path / "shot.mkv", moving_texture(7), **LOSSLESS, times=times)
     assert [frame.timestamp for frame in read_frames(path)] == pytest.approx(np.array(times) / 100, abs=1e-3)
+
+
+@pytest.mark.parametrize(("suffix", "codec"), [(".ts", "libx264"), (".mpg", "mpeg2video"), (".avi", "mpeg4")])
+def test_a_late_range_holds_the_frames_that_it_names(tmp_path, suffix, codec):
+    """These containers have no index of their keyframes, and a jump lands behind the one that is needed."""
+    options = {"g": "50", "bf": "2"}
+    path = write_video(tmp_path / f"shot{suffix}", moving_texture(130, size=(160, 120)), codec, options=options)
+    everything = list(read_frames(path))
+    for start in (100, 107, 119, 127):
+        late = list(read_frames(path, slice(start, None)))
+        assert [frame.index for frame in late] == list(range(start, len(everything)))
+        for frame, same in zip(late, everything[start:], strict=True):
+            assert frame.timestamp == same.timestamp
+            np.testing.assert_array_equal(frame.image, same.image)
+
+
+def test_a_late_range_that_no_jump_finds_is_decoded_from_the_start(tmp_path, monkeypatch):
+    path = write_video(tmp_path / "shot.mkv", moving_texture(110, size=(160, 120)))
+    monkeypatch.setattr("factorsfm.frames.video._LEADS", ())
+    assert [frame.index for frame in read_frames(path, slice(104, 107))] == [104, 105, 106]
 
 
 def test_a_file_that_grows_is_read_as_far_as_it_was_and_warned_of(tmp_path, caplog):
@@ -108,10 +267,10 @@ def test_a_file_that_vanishes_with_its_network_is_no_shorter_file(tmp_path, monk
     frames = read_frames(path)
     next(frames)
 
-    def fail(_: object) -> None:
+    def fail(*_: object) -> None:
         raise av.error.OSError(5, "Input/output error")
 
-    monkeypatch.setattr("factorsfm.frames.video._packet_frames", fail)
+    monkeypatch.setattr("factorsfm.frames.container._packet_frames", fail)
     path.unlink()
     with pytest.raises(InputError, match=r"shot\.mkv cannot be read any more: No such file"):
         list(frames)
@@ -182,6 +341,75 @@ def test_film_that_is_stored_as_interlaced_stays_whole(tmp_path):
     assert frames[0].image.shape == (240, 320, 3)
     apart = list(read_frames(tmp_path / "shot.mp4", fields="apart"))
     assert len(apart) == 24
+
+
+def detailed(count: int, step: float) -> list[np.ndarray]:
+    """Moving texture that differs strongly from line to line, and a still half with grain."""
+    rng = np.random.default_rng(1)
+    lines = rng.normal(0.0, 25.0, (240, 1, 1))
+    images = []
+    for image in moving_texture(count, step):
+        image = 0.6 * image.astype(np.float64) + 50 + lines
+        image[:, 160:] = image[:, :1]
+        images.append(np.clip(image + rng.normal(0.0, 2.0, (240, 320, 1)), 0, 255).astype(np.uint8))
+    return images
+
+
+@pytest.mark.parametrize("top_first", [True, False])
+@pytest.mark.parametrize("codec", ["libx264", "mpeg2video"])
+@pytest.mark.parametrize("step", [1.0, 7.0])
+def test_vertical_detail_is_no_second_moment(tmp_path, codec, top_first, step):
+    """The lines of two fields differ by the detail of the picture, which outweighs slow motion."""
+    film = [image for image in detailed(26, step) for _ in range(2)]
+    stored = interlaced(tmp_path / "film.mkv", film, codec, top_first=top_first)
+    assert next(read_frames(stored)).image.shape == (240, 320, 3)
+    video = interlaced(tmp_path / "video.mkv", detailed(52, step / 2), codec, top_first=top_first)
+    assert next(read_frames(video)).image.shape == (120, 320, 3)
+
+
+def test_where_nothing_moves_the_flags_count(tmp_path):
+    path = interlaced(tmp_path / "shot.mkv", detailed(52, 0.0), top_first=True)
+    assert next(read_frames(path)).image.shape == (120, 320, 3)
+
+
+def test_film_whose_fields_are_spread_over_video_frames_is_taken_apart(tmp_path):
+    """24 in 30 frames a second by fields: two of five frames hold fields of two images."""
+    film = detailed(20, 4.0)
+    fields = [image for k, image in enumerate(film) for _ in range(2 + k % 2)]
+    path = interlaced(tmp_path / "shot.mkv", fields, top_first=True)
+    assert next(read_frames(path)).image.shape == (120, 320, 3)
+
+
+def joined(tmp_path, whole: list[np.ndarray], moments: list[np.ndarray]) -> Path:
+    """A video of whole frames that becomes interlaced."""
+    first = write_video(tmp_path / "first.ts", whole)
+    path = interlaced(tmp_path / "shot.ts", moments)
+    path.write_bytes(first.read_bytes() + path.read_bytes())
+    return path
+
+
+def test_frames_that_become_interlaced_soon_are_taken_apart(tmp_path):
+    moments = detailed(60, 2.0)
+    path = joined(tmp_path, moments[:20:2], moments[20:])
+    frames = list(read_frames(path))
+    assert len(frames) == 60
+    assert frames[0].is_field
+
+
+def test_frames_that_become_interlaced_late_are_not_tracked_combed(tmp_path):
+    moments = detailed(120, 2.0)
+    path = joined(tmp_path, moments[:80:2], moments[80:])
+    with pytest.raises(InputError, match=r"shot\.ts is interlaced before frame 4\d, but not at its beginning; fields"):
+        list(read_frames(path))
+    assert len(list(read_frames(path, slice(0, 30)))) == 30
+    assert len(list(read_frames(path, fields="apart"))) == 120
+    assert len(list(read_frames(path, fields="blend"))) == 60
+
+
+def test_frames_of_one_moment_that_are_flagged_late_stay_whole(tmp_path):
+    film = detailed(60, 2.0)
+    path = joined(tmp_path, film[:40], [image for image in film[40:] for _ in range(2)])
+    assert len(list(read_frames(path))) == 60
 
 
 def test_progressive_video_is_taken_apart_on_demand(tmp_path):

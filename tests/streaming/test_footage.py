@@ -106,6 +106,14 @@ def test_uneven_times_are_noted():
     assert [frame.timestamp for frame in result.frames] == times.tolist()
 
 
+def test_times_that_jump_back_are_noted():
+    times = np.arange(FRAMES) / 24
+    times[FRAMES // 2 :] -= times[FRAMES // 2]
+    _, result = solved(frames_at(times))
+    (note,) = [note for note in result.notes if "do not rise" in note]
+    assert note.startswith(f"Times of frames do not rise, before frame {FRAMES // 2}: all frames count as recorded")
+
+
 @pytest.fixture(scope="module")
 def in_bars() -> tuple[list[np.ndarray], list[np.ndarray]]:
     """The shot under bars of unlike height, and the part of it that is left."""
