@@ -40,6 +40,7 @@ _SEEK_FROM = 100  # frames: decoding fewer is faster than reading the packets of
 _LEADS = (0, _SEEK_FROM)  # frames before the wanted one to jump to: TS and MPG lead past its keyframe
 _COMPARED = 16  # frames at the start of the file whose timestamps must be those of its packets
 _PROBED = 26  # frames of a file from which fields, their order and their moments are read
+_PROGRESSIVE = 1  # order of the fields, as FFmpeg names a codec that states that there are none
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +89,8 @@ def open_video(path: Path) -> VideoFile:
         orientation = Orientation.of(first)
         aspect = float(stream.sample_aspect_ratio or 1) or 1.0
         order = int(stream.codec_context.field_order or 0)
-        probed = [first, *([] if second is None else [second]), *itertools.islice(frames, _PROBED - 2)]
+        more = 0 if order == _PROGRESSIVE else _PROBED - 2  # to decode them takes a second in 4K
+        probed = [first, *([] if second is None else [second]), *itertools.islice(frames, more)]
         flagged = [frame for frame in probed if frame.interlaced_frame]
         top_first = not flagged or is_top_first(flagged, order)
         film = bool(flagged) and show_one_moment(probed, top_first=top_first)
