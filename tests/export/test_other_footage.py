@@ -10,6 +10,7 @@ import pycolmap
 import pytest
 
 from factorsfm.export import ExportOptions, export
+from factorsfm.export.footage import image_sequence
 from factorsfm.frames.folders import read_pixels
 from factorsfm.frames.plates import read_exr
 from factorsfm.frames.reading import read_frames
@@ -84,6 +85,14 @@ def test_a_movie_behind_a_solved_sequence(tmp_path: Path) -> None:
     export(numbered(1033), tmp_path / "out", format="nuke", options=ExportOptions(footage=footage))
     plate = nuke_nodes((tmp_path / "out" / "camera.nk").read_text())["Plate"]
     assert (plate["first"], plate["last"], plate["frame"]) == ("1", "21", "1033")
+
+
+def test_the_number_need_not_be_last_in_the_name(tmp_path: Path) -> None:
+    for number in range(1001, 1004):
+        (tmp_path / f"shot_{number}_v02.png").touch()
+    sequence = image_sequence(tmp_path)
+    assert Path(sequence.pattern) == tmp_path / "shot_%04d_v02.png"
+    assert (sequence.first, sequence.last) == (1001, 1003)
 
 
 def test_gaps_of_the_footage_are_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
