@@ -11,6 +11,7 @@ from typing import get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.frames.aspect import check_pixel_aspect
 from factorsfm.frames.fields import Fields
 from factorsfm.frames.folders import IMAGE_SUFFIXES, read_image, stated_pixel_aspect
 from factorsfm.frames.frame import Frame, bgr_image
@@ -18,8 +19,6 @@ from factorsfm.frames.numbering import chosen, numbered_images
 from factorsfm.frames.ranges import checked_range
 from factorsfm.frames.video import decode, open_video
 from factorsfm.support.errors import InputError
-
-_ASPECTS = (0.25, 4.0)  # of pixels: anamorphic lenses squeeze by 2 at most, and fields halve the lines
 
 
 def read_frames(
@@ -83,8 +82,8 @@ def check_footage(fields: str, pixel_aspect: float | None) -> None:
     """
     if fields not in get_args(Fields):
         raise InputError(f"unknown fields '{fields}', expected one of {', '.join(get_args(Fields))}")
-    if pixel_aspect is not None and not _ASPECTS[0] <= pixel_aspect <= _ASPECTS[1]:
-        raise InputError(f"the pixel aspect is {pixel_aspect:g}; {_ASPECTS[0]:g} to {_ASPECTS[1]:g} is expected")
+    if pixel_aspect is not None:
+        check_pixel_aspect(pixel_aspect)
 
 
 def uniform(frames: Iterator[Frame], source: str, start: int) -> Iterator[Frame]:

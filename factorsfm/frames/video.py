@@ -21,6 +21,7 @@ from av.video.codeccontext import VideoCodecContext
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
+from factorsfm.frames.aspect import stated_or_square
 from factorsfm.frames.fields import Fields, FieldSplitter, blended, is_top_first, show_one_moment
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.picture import Orientation, Picture
@@ -74,7 +75,7 @@ def open_video(path: Path) -> VideoFile:
         second = next(frames, None)
         timed = first.time is not None and second is not None and (second.time or 0.0) > first.time
         orientation = Orientation.of(first)
-        aspect = float(stream.sample_aspect_ratio or 1) or 1.0
+        aspect = stated_or_square(float(stream.sample_aspect_ratio or 1), path)
         order = int(stream.codec_context.field_order or 0)
         probed = [first, *([] if second is None else [second])]
         interlaced = any(frame.interlaced_frame for frame in probed)

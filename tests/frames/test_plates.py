@@ -99,7 +99,7 @@ def test_damaged_plates_say_nothing_on_standard_error(tmp_path, capfd):
     assert capfd.readouterr().err == ""
 
 
-def test_pixel_aspect_of_plates(tmp_path):
+def test_pixel_aspect_of_plates(tmp_path, caplog):
     write_exr(tmp_path / "a.1.exr", {"RGB": colors(np.float16, 1)}, pixelAspectRatio=2.0)
     assert next(read_frames(tmp_path)).pixel_aspect == 2.0
     assert next(read_frames(tmp_path, pixel_aspect=1.5)).pixel_aspect == 1.5
@@ -107,6 +107,11 @@ def test_pixel_aspect_of_plates(tmp_path):
         for aspect, expected in (((4, 3), 4 / 3), ((0, 1), 1.0), ((2**32 - 1, 2**32 - 1), 1.0)):
             (tmp_path / "a.dpx").write_bytes(magic + bytes(1624) + struct.pack(f"{order}2I", *aspect))
             assert stated_pixel_aspect(tmp_path / "a.dpx") == pytest.approx(expected)
+    assert caplog.text == ""
+    (tmp_path / "a.dpx").write_bytes(b"SDPX" + bytes(1624) + struct.pack(">2I", 1, 100))
+    write_exr(tmp_path / "a.1.exr", {"RGB": colors(np.float16, 1)}, pixelAspectRatio=100.0)
+    assert stated_pixel_aspect(tmp_path / "a.dpx") == stated_pixel_aspect(tmp_path / "a.1.exr") == 1.0
+    assert caplog.text.count("which is ignored; 0.25 to 4 is expected") == 2
     (tmp_path / "a.dpx").write_bytes(b"SDPX")
     assert stated_pixel_aspect(tmp_path / "a.dpx") == 1.0
 
