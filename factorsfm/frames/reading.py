@@ -60,7 +60,8 @@ def read_frames(
                 raise InputError(f"{path} is a single image; a video file or a folder of images is expected")
             found = with_aspect(decode(open_video(path), selection, fields), pixel_aspect)
         else:
-            raise InputError(f"{path} does not exist; a video file or a folder of images is expected")
+            problem = "is neither a file nor a folder" if path.exists() else "does not exist"
+            raise InputError(f"{path} {problem}; a video file or a folder of images is expected")
         return uniform(found, str(path), selection.start)
     if isinstance(source, np.ndarray) and (source.ndim == 2 or (source.ndim == 3 and source.shape[-1] in (3, 4))):
         raise InputError(f"an array of shape {source.shape} is a single image; a sequence of images is expected")

@@ -199,11 +199,15 @@ def _opened(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
     """The container and its video. A file that names others, as a playlist does, can name none of a network.
 
     Raises:
-        InputError: it is no container, or holds no video.
+        InputError: it is no container, holds no video, or cannot be read.
     """
     try:
         container = av.open(f"{_FILE}{path}", options={"protocol_whitelist": "file"})
     except (FFmpegError, OSError, ValueError) as error:
+        try:
+            path.open("rb").close()
+        except OSError as reason:
+            raise InputError(f"{path} cannot be read: {reason.strerror}") from error
         raise InputError(
             f"{path} cannot be decoded as a video; it is damaged, still being written, or not a video"
         ) from error

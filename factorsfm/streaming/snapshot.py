@@ -64,8 +64,11 @@ def write_snapshot(path: Path, state: Mapping[str, Any]) -> None:
 
 def _check_replaceable(path: Path) -> None:
     """Refuse to replace a file that is no snapshot, such as the footage."""
+    if not path.is_file():
+        return
     try:
-        begin = path.open("rb").read(len(_ANY_MAGIC)) if path.is_file() else b""
+        with path.open("rb") as file:
+            begin = file.read(len(_ANY_MAGIC))
     except OSError as error:
         raise InputError(f"snapshot {path} cannot be written: {error.strerror}") from error
     if begin and begin != _ANY_MAGIC:
