@@ -25,12 +25,16 @@ def spare_footage(targets: Iterable[str | Path], *footage: object) -> None:
     # What is not there overwrites nothing, and is no new image either unless its name says so.
     risky = [Path(t) for t in targets if os.path.lexists(t) or Path(t).suffix.lower() in IMAGE_SUFFIXES]
     for given in footage:
-        if not risky or not isinstance(given, str | Path) or not Path(given).exists():
+        if not risky or not isinstance(given, str | Path) or not os.path.exists(given):
             continue
-        known = Path(given).resolve()
-        files = {path.resolve() for path in list_images(known)} if known.is_dir() else set[Path]()
+        known = _real(given)
+        files = {_real(path) for path in list_images(Path(given))} if known.is_dir() else set[Path]()
         places = {place for path in (known, *files) for place in (path, *path.parents)}
         for target in risky:
-            new = target.resolve()
+            new = _real(target)
             if new in places or (known.is_dir() and known == new.parent and new.suffix.lower() in IMAGE_SUFFIXES):
                 raise InputError(f"the output {target} would overwrite the footage {given}; choose another path")
+
+
+def _real(path: str | Path) -> Path:
+    return Path(os.path.realpath(path))  # `Path.resolve` fails on links that lead to themselves

@@ -15,6 +15,7 @@ def footage(tmp_path: Path) -> Path:
     (tmp_path / "link.mp4").symlink_to("shot.mp4")
     (tmp_path / "plates").mkdir()
     (tmp_path / "links").mkdir()
+    (tmp_path / "links" / "loop.png").symlink_to("loop.png")
     for number in (1001, 1002):
         (tmp_path / "plates" / f"plate.{number}.png").write_text("plate")
         (tmp_path / "links" / f"plate.{number}.png").symlink_to(tmp_path / "plates" / f"plate.{number}.png")
@@ -51,6 +52,7 @@ def test_what_would_change_footage_is_refused(footage: Path, target: str, source
         ("plate.1001.png", "plates"),
         ("shot.mp4", "camera:0"),
         ("shot.mp4", "gone.mp4"),
+        ("shot.mp4", "rtsp://camera/" + 300 * "x"),
     ],
 )
 def test_what_lies_beside_footage_is_written(footage: Path, target: str, source: str) -> None:
