@@ -136,7 +136,8 @@ def find_videos(source: Path, fields: Fields = "auto") -> list[Video]:
     elif source.is_file():
         paths = [source]
     else:
-        raise InputError(f"{source} does not exist; a video file or a folder of videos is expected")
+        problem = "is neither a file nor a folder" if source.exists() else "does not exist"
+        raise InputError(f"{source} {problem}; a video file or a folder of videos is expected")
     stems = Counter(path.stem.lower() for path in paths)
     videos = []
     for path in paths:

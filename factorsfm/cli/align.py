@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
     """Write the aligned result; see `Command.run`."""
     output = arguments.output or arguments.result
-    check_directory(output)
+    check_directory(output, arguments.footage)
     progress("aligning", 0, None)
     aligned = align(
         read_result(arguments.result),

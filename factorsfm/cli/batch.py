@@ -64,7 +64,7 @@ def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
         shots, unread = _find_shots(crew, videos, known, one_thread=_one_thread(workers, scheduler), show=show)
     jobs = plan_jobs(shots, method, output, several=source.is_dir())
     for job in jobs:
-        check_directory(job.folder)
+        check_directory(job.folder, job.video.path)
     _remove_others(output, jobs, unread)
     index = Index(source, output, shots, unread, jobs)
     waiting = [job for job in jobs if not job.is_done()]

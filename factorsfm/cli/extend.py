@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
     """Write the result with the further images; see `Command.run`."""
-    check_directory(arguments.output)
+    check_directory(arguments.output, arguments.images, arguments.source)
     reconstruction = add_images(
         arguments.result,
         arguments.images,

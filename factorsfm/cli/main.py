@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import io
 import logging
+import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from logging.handlers import MemoryHandler
 from typing import Any, NoReturn
 
@@ -32,6 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         The exit status: 0 done, 2 bad input, 3 the shot cannot be reconstructed, 130 interrupted.
     """
+    _open_outputs()
     arguments = _parsed(sys.argv[1:] if argv is None else argv)
     command = _COMMANDS[arguments.command]
     terminal = sys.stderr.isatty()
@@ -42,7 +46,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         with progress:
             said = command.run(arguments, progress)
             progress.clear()
-            print(as_text(said))
     except ReconstructionError as error:
         return _complain(f"error: {error}", NOT_RECONSTRUCTED)
     except FactorsfmError as error:
@@ -55,9 +58,34 @@ def main(argv: Sequence[str] | None = None) -> int:
         log.buffer.clear()
         return _complain(f"error: {str(error) or 'not enough memory'}", BAD_INPUT)
     finally:
-        log.flush()
-        lines.say_rest()
+        with suppress(OSError):  # of standard error, which may be full
+            log.flush()
+            lines.say_rest()
+    _say(as_text(said))
     return 0
+
+
+def _open_outputs() -> None:
+    """Let standard output and error take every text: what their encoding does not know becomes an escape.
+
+    A closed one leads nowhere.
+    """
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w", encoding="utf-8"))
+        elif isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
+            stream.reconfigure(errors="backslashreplace")
+
+
+def _say(text: str) -> None:
+    """Print the outcome. Everything is written by then, so an output that is full or gone is no failure."""
+    try:
+        print(text, flush=True)
+    except OSError as error:
+        _complain(f"done, but standard output cannot be written: {error.strerror or error}", 0)
+        with suppress(OSError):  # else the rest is written once more at the end of the program, and fails again
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _start_log(lines: LogHandler, verbose: int, *, at_once: bool) -> MemoryHandler:
@@ -70,7 +98,8 @@ def _start_log(lines: LogHandler, verbose: int, *, at_once: bool) -> MemoryHandl
 
 
 def _complain(message: str, status: int) -> int:
-    print(f"factorsfm: {' '.join(message.split())}", file=sys.stderr)
+    with suppress(OSError):
+        print(f"factorsfm: {' '.join(message.split())}", file=sys.stderr, flush=True)
     return status
 
 

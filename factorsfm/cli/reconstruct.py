@@ -71,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
     """Write the result, or the reason of the failure; see `Command.run`."""
-    check_directory(arguments.output)
+    check_directory(arguments.output, arguments.source)
     if arguments.align and arguments.control is not None:
         raise InputError("--align and --control are given; a result in the world of its control is not aligned")
     camera, frames = open_camera(arguments.camera), range_of(arguments)

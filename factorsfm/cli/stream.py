@@ -33,6 +33,7 @@ from factorsfm.cli.stream_results import StreamResults
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.live_sources import Source, open_source
 from factorsfm.frames.raw import RawFormat
+from factorsfm.frames.targets import spare_footage
 from factorsfm.inertial.mounting import open_imu
 from factorsfm.inertial.recording import ImuRecording
 from factorsfm.inputs import check_matched, input_options
@@ -225,7 +226,8 @@ def _check(arguments: argparse.Namespace) -> None:
         raise InputError("--cuts cannot be combined with --imu: the recording of an IMU is of one shot")
     if arguments.snapshot and not arguments.snapshot.absolute().parent.is_dir():
         raise InputError(f"snapshot {arguments.snapshot} cannot be written: its folder does not exist")
-    check_directory(arguments.output)
+    check_directory(arguments.output, arguments.source)
+    spare_footage([path for path in (arguments.snapshot, arguments.record) if path], arguments.source)
     if arguments.cuts and arguments.output.is_dir() and any(arguments.output.iterdir()):
         raise InputError(f"the output folder {arguments.output} is not empty; --cuts needs a new or empty one")
 

@@ -13,7 +13,7 @@ from factorsfm.frames.frame import Frame
 from factorsfm.frames.numbering import missing_numbers
 from factorsfm.frames.photographs import in_format_of
 from factorsfm.frames.reading import read_frames
-from factorsfm.frames.sequences import NUMBERED, sequence_numbers
+from factorsfm.frames.sequences import numbered_names, sequence_numbers
 from factorsfm.frames.unordered import read_images
 from factorsfm.result.reconstruction import FrameResult
 from factorsfm.support.errors import InputError
@@ -80,15 +80,17 @@ def image_sequence(folder: Path) -> Sequence:
     if not names:
         raise InputError(f"the footage {folder} holds no images")
     numbers = sequence_numbers(names)
-    parts = [match for match in map(NUMBERED.fullmatch, names) if match is not None]
-    if numbers is not None:
-        digits = len(parts[0][2])
-        padded = all(match[2] == f"{number:0{digits}d}" for match, number in zip(parts, numbers, strict=True))
-        if padded and len({match[3] for match in parts}) == 1:
+    parts = numbered_names(names)
+    if numbers is not None and parts is not None:
+        digits = len(parts[0].digits)
+        padded = all(part.digits == f"{part.number:0{digits}d}" for part in parts)
+        if padded and len({part.suffix for part in parts}) == 1:
             missing = missing_numbers(numbers)
             if missing:
                 logger.warning("the images in %s have gaps: %s are missing", folder, missing)
-            return Sequence(folder.absolute(), parts[0][1], digits, parts[0][3], numbers[0], numbers[-1], missing)
+            return Sequence(
+                folder.absolute(), parts[0].prefix, digits, parts[0].suffix, numbers[0], numbers[-1], missing
+            )
     raise InputError(f"the images in {folder} are not numbered alike, as film tools expect it of a sequence")
 
 

@@ -29,6 +29,8 @@ from factorsfm.export.tracks import (
 from factorsfm.export.trajectory import write_kitti, write_tum
 from factorsfm.export.usd import write_usd
 from factorsfm.export.writing import complete_file, complete_folder
+from factorsfm.frames.targets import spare_footage
+from factorsfm.result.image_sources import footage_of
 from factorsfm.result.reconstruction import Reconstruction
 from factorsfm.support.errors import InputError
 from factorsfm.support.file_names import check_name
@@ -149,7 +151,7 @@ def export(
 
     Raises:
         InputError: the format is unknown, a package that it needs is missing, no frame is registered, an image name
-            leaves its folder, or the path cannot be written.
+            leaves its folder, or the path cannot be written or is that of the footage.
     """
     if format not in FORMATS:
         raise InputError(f'"{format}" is no export format; the formats are {", ".join(FORMATS)}')
@@ -165,6 +167,7 @@ def export(
         )
     options = options or ExportOptions()
     _check_training(format, options)
+    spare_footage([path], options.footage, *footage_of(reconstruction.options))
     shot = make_shot(reconstruction, options, chosen.defaults)
     with (complete_folder if chosen.is_folder else complete_file)(Path(path)) as place:
         chosen.write(shot, place)

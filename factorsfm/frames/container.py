@@ -29,11 +29,15 @@ def opened_video(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
     """The container and its best video stream, never a cover. A file that names others can name none of a network.
 
     Raises:
-        InputError: it is no container, text, a single image, or holds no video.
+        InputError: it cannot be read, is no container, text, a single image, or holds no video.
     """
     try:
         container = av.open(f"{_FILE}{path}", options={"protocol_whitelist": "file"})
     except (FFmpegError, OSError, ValueError) as error:
+        try:
+            path.open("rb").close()
+        except OSError as reason:
+            raise InputError(f"{path} cannot be read: {reason.strerror}") from error
         raise InputError(
             f"{path} cannot be decoded as a video; it is damaged, still being written, or not a video"
         ) from error

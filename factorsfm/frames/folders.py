@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.frames.frame import Frame
+from factorsfm.frames.image_damage import damage_of, without_padding
 from factorsfm.frames.plates import PLATE_SUFFIXES, Pixels, plate_pixel_aspect, read_dpx, read_exr
 from factorsfm.frames.sequences import sequence_numbers
-from factorsfm.frames.silence import quiet_opencv
+from factorsfm.frames.silence import held_back, quiet_opencv
 from factorsfm.frames.tone import eight_bits
 from factorsfm.support.errors import InputError
 from factorsfm.support.json_text import is_text
@@ -25,9 +26,6 @@ from factorsfm.support.json_text import is_text
 logger = logging.getLogger(__name__)
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}) | PLATE_SUFFIXES
-_JPEG_START, _JPEG_END = b"\xff\xd8", b"\xd9"
-_JPEG_MARKER = re.compile(rb"\xff+([^\x00\xff\xd0-\xd7])", re.DOTALL)  # without stuffed bytes and restart markers
-_PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 _POLL_SECONDS = 0.1  # between two listings of a folder that is being filled
 _PATIENCE_SECONDS = 2.0  # a file that has not changed for so long and cannot be decoded is damaged
 
@@ -161,12 +159,13 @@ def read_pixels(path: Path) -> Pixels:
     if path.suffix.lower() == ".dpx":
         return read_dpx(data, path)
     # Checked before decoding: libjpeg would fill the rest with grey, libpng would write to stderr, past all logging.
-    if _is_truncated(data):
-        raise InputError(f"image {path} is truncated")
+    damage = damage_of(data)
+    if damage in ("truncated", "damaged"):
+        raise InputError(f"image {path} is {damage}")
     try:
-        with quiet_opencv():
-            color = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
-            image = cv2.imdecode(np.frombuffer(data, np.uint8), color) if data else None
+        if damage == "doubtful" and all(map(_libjpeg_complains, (data, without_padding(data)))):
+            raise InputError(f"image {path} is damaged")
+        image = _decoded(data)
     except cv2.error as error:
         raise InputError(f"image {path} cannot be decoded; it has too many pixels or is damaged") from error
     if image is None:
@@ -176,6 +175,18 @@ def read_pixels(path: Path) -> Pixels:
     return np.asarray(image)
 
 
+def _decoded(data: bytes) -> NDArray[np.generic] | None:
+    with quiet_opencv():
+        color = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
+        return cv2.imdecode(np.frombuffer(data, np.uint8), color) if data else None
+
+
+def _libjpeg_complains(data: bytes) -> bool:
+    with held_back() as said:
+        _decoded(data)
+    return "Corrupt JPEG data" in said.errors
+
+
 def stated_pixel_aspect(path: Path) -> float:
     """Width of a pixel over its height as an image file says, 1 if it says nothing.
 
@@ -183,17 +194,3 @@ def stated_pixel_aspect(path: Path) -> float:
         InputError: a plate is damaged.
     """
     return plate_pixel_aspect(path) if path.suffix.lower() in PLATE_SUFFIXES else 1.0
-
-
-def _is_truncated(data: bytes) -> bool:
-    """Whether a JPEG or PNG file lacks its end marker."""
-    if data.startswith(_PNG_START):
-        return _PNG_END not in data
-    if not data.startswith(_JPEG_START):
-        return False
-    position = len(_JPEG_START)
-    while marker := _JPEG_MARKER.search(data, position):
-        if marker[1] == _JPEG_END:
-            return False
-        position = marker.end() + int.from_bytes(data[marker.end() : marker.end() + 2], "big")  # skip the segment
-    return True

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from factorsfm.frames.folders import IMAGE_SUFFIXES, list_images
-from factorsfm.frames.sequences import NUMBERED, sequence_numbers
+from factorsfm.frames.sequences import is_negative, mixture, sequence_numbers
 from factorsfm.support.errors import InputError
 
 _NAMED_GAPS = 5
@@ -18,30 +18,29 @@ def numbered_images(folder: Path) -> list[tuple[int, Path]]:
     """The images of a shot with the numbers of its frames: those in the names of a sequence, else counted from 0.
 
     Raises:
-        InputError: the folder holds no images, or two files for each frame.
+        InputError: the folder holds no images, several sequences, other files beside a long one, or negative numbers.
     """
     paths = list_images(folder)
     if not paths:
         suffixes = ", ".join(sorted(suffix[1:] for suffix in IMAGE_SUFFIXES))
         raise InputError(f"folder {folder} holds no images ({suffixes})")
-    numbers = sequence_numbers([path.name for path in paths])
-    if numbers is None:
-        _check_one_sequence(folder, paths)
+    names = [path.name for path in paths]
+    refuse_negative(folder, names)
+    numbers = sequence_numbers(names)
+    if numbers is None and (found := mixture(names)):
+        raise InputError(f"folder {folder} holds {found}; a folder with one of them is expected")
     return list(zip(range(len(paths)) if numbers is None else numbers, paths, strict=True))
 
 
-def _check_one_sequence(folder: Path, paths: list[Path]) -> None:
-    """Refuse a folder whose files are several whole sequences, such as plates and their previews."""
-    sequences: dict[str, list[int]] = {}
-    for path in paths:
-        match = NUMBERED.fullmatch(path.name)
-        if match is None:
-            return
-        sequences.setdefault(f"{match[1]}{'#' * len(match[2])}{match[3].lower()}", []).append(int(match[2]))
-    if len(sequences) > 1 and len(set(map(tuple, sequences.values()))) == 1 and len(paths) > len(sequences):
+def refuse_negative(folder: Path, names: Sequence[str]) -> None:
+    """Refuse negative numbers of frames, as in plate.-0024.png: sorted by name, time would run backwards.
+
+    Raises:
+        InputError: there are some.
+    """
+    if found := next(filter(is_negative, names), None):
         raise InputError(
-            f"folder {folder} holds {len(sequences)} sequences ({', '.join(sorted(sequences)[:3])}); "
-            "a folder with one of them is expected"
+            f"folder {folder} holds frames with negative numbers ({found}); numbers from 0 on are expected"
         )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import math
 import struct
 from importlib import import_module
 from pathlib import Path
@@ -13,6 +12,7 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.frames.aspect import stated_or_square
 from factorsfm.frames.silence import dropped_if_it_fails
 from factorsfm.support.errors import InputError
 
@@ -79,7 +79,8 @@ def _in_display_window(colors: Pixels, header: dict[str, Any], path: Path) -> Pi
 
 
 def plate_pixel_aspect(path: Path) -> float:
-    """Width of a pixel over its height, as the header of an EXR or DPX file says; 1 if it says nothing, or no number.
+    """Width of a pixel over its height, as the header of an EXR or DPX file says; 1 if it says nothing that
+    pixels can have.
 
     Raises:
         InputError: the file is damaged.
@@ -100,7 +101,7 @@ def plate_pixel_aspect(path: Path) -> float:
         order = ">" if header.startswith(b"SDPX") else "<"
         across, down = struct.unpack(f"{order}2I", header[_DPX_ASPECT].ljust(8, b"\xff"))
         aspect = across / down if down not in (0, _DPX_UNSET) and across != _DPX_UNSET else 1.0
-    return aspect if math.isfinite(aspect) and aspect > 0 else 1.0
+    return stated_or_square(aspect, path)
 
 
 def read_dpx(data: bytes, path: Path) -> Pixels:

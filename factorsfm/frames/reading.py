@@ -11,6 +11,7 @@ from typing import get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.frames.aspect import check_pixel_aspect
 from factorsfm.frames.fields import Fields
 from factorsfm.frames.folders import IMAGE_SUFFIXES, read_image, stated_pixel_aspect
 from factorsfm.frames.frame import Frame, bgr_image
@@ -18,8 +19,6 @@ from factorsfm.frames.numbering import chosen, numbered_images
 from factorsfm.frames.ranges import checked_range
 from factorsfm.frames.video import decode, open_video
 from factorsfm.support.errors import InputError
-
-_ASPECTS = (0.25, 4.0)  # of pixels: anamorphic lenses squeeze by 2 at most, and fields halve the lines
 
 
 def read_frames(
@@ -61,7 +60,8 @@ def read_frames(
                 raise InputError(f"{path} is a single image; a video file or a folder of images is expected")
             found = with_aspect(decode(open_video(path), selection, fields), pixel_aspect)
         else:
-            raise InputError(f"{path} does not exist; a video file or a folder of images is expected")
+            problem = "is neither a file nor a folder" if path.exists() else "does not exist"
+            raise InputError(f"{path} {problem}; a video file or a folder of images is expected")
         return uniform(found, str(path), selection.start)
     if isinstance(source, np.ndarray) and (source.ndim == 2 or (source.ndim == 3 and source.shape[-1] in (3, 4))):
         raise InputError(f"an array of shape {source.shape} is a single image; a sequence of images is expected")
@@ -83,8 +83,8 @@ def check_footage(fields: str, pixel_aspect: float | None) -> None:
     """
     if fields not in get_args(Fields):
         raise InputError(f"unknown fields '{fields}', expected one of {', '.join(get_args(Fields))}")
-    if pixel_aspect is not None and not _ASPECTS[0] <= pixel_aspect <= _ASPECTS[1]:
-        raise InputError(f"the pixel aspect is {pixel_aspect:g}; {_ASPECTS[0]:g} to {_ASPECTS[1]:g} is expected")
+    if pixel_aspect is not None:
+        check_pixel_aspect(pixel_aspect)
 
 
 def uniform(frames: Iterator[Frame], source: str, start: int) -> Iterator[Frame]:

@@ -1,13 +1,14 @@
-"""Libraries kept from writing to standard error, past all logging, what the caller reports as an error."""
+"""Libraries kept from writing to standard output and error, past all logging, what the caller reports as an error."""
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 import tempfile
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, field
 
 import cv2
@@ -50,21 +51,40 @@ def quiet_opencv() -> Iterator[None]:
 _held = threading.Lock()
 
 
+@dataclass(slots=True)
+class Said:
+    """What was held back: written to stderr by anybody, and printed by Python."""
+
+    errors: str = ""
+    printed: str = ""
+
+
 @contextmanager
-def dropped_if_it_fails() -> Iterator[None]:
-    """Hold back what anybody writes to stderr meanwhile: dropped if the block raises an exception, else passed on.
+def held_back() -> Iterator[Said]:
+    """Hold back what anybody writes to stderr meanwhile, and Python to stdout; it is known after the block.
 
     For libraries that know no log level. One thread at a time, since all of them share the file descriptor.
     """
+    said = Said()
     with _held, tempfile.TemporaryFile() as held:
         sys.stderr.flush()
         stderr = os.dup(2)
         os.dup2(held.fileno(), 2)
         try:
-            yield
+            with redirect_stdout(io.StringIO()) as printed:
+                yield said
         finally:
             sys.stderr.flush()
             os.dup2(stderr, 2)
             os.close(stderr)
-        held.seek(0)
-        sys.stderr.write(held.read().decode(errors="replace"))
+            held.seek(0)
+            said.errors, said.printed = held.read().decode(errors="replace"), printed.getvalue()
+
+
+@contextmanager
+def dropped_if_it_fails() -> Iterator[None]:
+    """Drop what is written meanwhile if the block raises an exception, else pass it on; see `held_back`."""
+    with held_back() as said:
+        yield
+    sys.stderr.write(said.errors)
+    print(said.printed, end="")

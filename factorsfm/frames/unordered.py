@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,16 +15,17 @@ from numpy.typing import NDArray
 from factorsfm.frames.fields import Fields
 from factorsfm.frames.folders import list_images, read_image, stated_pixel_aspect
 from factorsfm.frames.frame import Frame, bgr_image
-from factorsfm.frames.numbering import chosen, numbered_images
+from factorsfm.frames.numbering import chosen, numbered_images, refuse_negative
 from factorsfm.frames.ranges import checked_range
 from factorsfm.frames.reading import read_frames
-from factorsfm.frames.sequences import sequence_numbers
+from factorsfm.frames.sequences import mixture, sequence_numbers, split_sequences
 from factorsfm.frames.texture import BLANK_TEXTURE, image_texture
 from factorsfm.support.errors import InputError
 from factorsfm.support.json_text import as_text
 
 logger = logging.getLogger(__name__)
 
+_PHOTOGRAPH = re.compile(r"(?=\d*[A-Z_])[A-Z0-9_]{4}\d{4}\.\w+")  # DCF, the rule by which cameras name: IMG_1234.JPG
 _SAMPLED_PAIRS = 5  # consecutive pairs of images, evenly spread
 _SAMPLED_WIDTH = 480  # pixels
 _SAMPLED_CORNERS = 200
@@ -104,13 +106,19 @@ def looks_unordered(source: Path, frames: slice | None = None) -> bool:
 
     It does if the names differ in more than their numbers, or if in most of a few consecutive pairs the images have
     different sizes or so little overlap that corners cannot be tracked.
+
+    Raises:
+        InputError: the folder holds the frames of a shot, and something else: see `numbering.numbered_images`.
     """
     if not source.is_dir():
         return False
     images = list_images(source)
-    if sequence_numbers([path.name for path in images]) is not None:
+    names = [path.name for path in images]
+    refuse_negative(source, names)
+    if sequence_numbers(names) is not None:
         images = [path for _, path in chosen(numbered_images(source), checked_range(frames or slice(None)))]
     else:
+        _refuse_mixture(source, names)
         images = images[frames or slice(None)]
     if len(images) < 2:
         return False
@@ -120,10 +128,33 @@ def looks_unordered(source: Path, frames: slice | None = None) -> bool:
     return bool(reason)
 
 
+def _refuse_mixture(folder: Path, names: list[str]) -> None:
+    """Refuse several sequences in a folder, or other files beside one, unless these are photographs.
+
+    Photographs have the names that cameras give, or share too little with the next one for a shot.
+    """
+    found = mixture(names)
+    if not found:
+        return
+    sequences, _ = split_sequences(names)
+    files = [[folder / f"{name.prefix}{name.digits}{name.suffix}" for name in sequence] for sequence in sequences]
+    if any(_PHOTOGRAPH.fullmatch(sequence[0].name) for sequence in files) or _too_little_is_shared(files[0]):
+        return
+    raise InputError(
+        f"folder {folder} holds {found}; a folder with one of them is expected, unless they are given as unordered"
+    )
+
+
 def _why_unordered(paths: list[Path]) -> str:
     patterns = {path.stem.rstrip("0123456789") for path in paths}
-    if len(patterns) > 1 or any(not path.stem[-1:].isdigit() for path in paths):
+    alike = len(patterns) == 1 and all(path.stem[-1:].isdigit() for path in paths)
+    if not alike and sequence_numbers([path.name for path in paths]) is None:
         return "the names are not numbered alike"
+    return _too_little_is_shared(paths)
+
+
+def _too_little_is_shared(paths: list[Path]) -> str:
+    """Why images in this order are no shot by what they show; empty if they are one."""
     shares = []
     for k in np.unique(np.linspace(0, len(paths) - 2, _SAMPLED_PAIRS).astype(int)):
         try:

@@ -15,6 +15,7 @@ import numpy as np
 from av.error import FFmpegError
 from numpy.typing import NDArray
 
+from factorsfm.frames.aspect import stated_or_square
 from factorsfm.frames.container import (
     announced_seconds,
     decoded,
@@ -24,10 +25,10 @@ from factorsfm.frames.container import (
     problem,
     video_streams,
 )
-from factorsfm.frames.damage import Numbers, warn_if_short
 from factorsfm.frames.fields import CombWatch, Fields, FieldSplitter, blended, is_top_first, show_one_moment
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.picture import Orientation, Picture
+from factorsfm.frames.video_damage import Numbers, warn_if_short
 from factorsfm.support.errors import InputError
 
 logger = logging.getLogger(__name__)
@@ -87,7 +88,7 @@ def open_video(path: Path) -> VideoFile:
         second = next(frames, None)
         timed = first.time is not None and second is not None and (second.time or 0.0) > first.time
         orientation = Orientation.of(first)
-        aspect = float(stream.sample_aspect_ratio or 1) or 1.0
+        aspect = stated_or_square(float(stream.sample_aspect_ratio or 1), path)
         order = int(stream.codec_context.field_order or 0)
         more = 0 if order == _PROGRESSIVE else _PROBED - 2  # to decode them takes a second in 4K
         probed = [first, *([] if second is None else [second]), *itertools.islice(frames, more)]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from factorsfm.frames.folders import IMAGE_SUFFIXES
 from factorsfm.frames.frame import Frame
+from factorsfm.frames.sequences import last_number
 from factorsfm.support.errors import InputError
 
 _ASPECT_TOLERANCE = 0.02  # relative
@@ -21,7 +21,7 @@ class FrameFolder:
     """A folder whose files belong to frames; a frame may lack one.
 
     A file belongs to the frame whose name it bears ("a.npy" or "a.jpg.npy" for "a.jpg"), otherwise to the frame with
-    its number: the last number in the frame's name, or the frame's index if the name has none.
+    its number: the last number in the frame's name that is no version, or the frame's index if the name has none.
 
     Args:
         path: the folder.
@@ -55,7 +55,7 @@ class FrameFolder:
         for file in files:
             stem = image_stem(file.stem)
             self._by_name.setdefault(stem, file)
-            if (number := _last_number(stem)) is not None:
+            if (number := last_number(stem)) is not None:
                 by_number.setdefault(number, []).append(file)
         self._by_number = {number: same[0] for number, same in by_number.items() if len(same) == 1}
 
@@ -75,7 +75,7 @@ class FrameFolder:
         for name in (frame.name, stem):
             if name in self._by_name:
                 return self._by_name[name]
-        number = _last_number(stem)
+        number = last_number(stem)
         return self._by_number.get(frame.index if number is None else number)
 
 
@@ -95,8 +95,3 @@ def check_aspect(array: NDArray[Any], frame: Frame, path: Path) -> None:
         raise InputError(
             f"{path} is {width}x{height} and its frame {frame_width}x{frame_height}: the aspect ratios must agree"
         )
-
-
-def _last_number(stem: str) -> int | None:
-    numbers = re.findall(r"\d+", stem)
-    return int(numbers[-1]) if numbers else None

@@ -6,8 +6,10 @@ import base64
 from pathlib import Path
 
 from factorsfm.export.writing import complete_file
+from factorsfm.frames.targets import spare_footage
 from factorsfm.report.document import data_of, with_data
 from factorsfm.report.thumbnails import retake
+from factorsfm.result.image_sources import footage_of
 from factorsfm.result.reading import read_result
 from factorsfm.support.errors import InputError
 
@@ -23,7 +25,7 @@ def write_desk(report: Path, footage: Path | None = None) -> Path | None:
         footage: the shot, see `ExportOptions.footage`.
 
     Raises:
-        InputError: the result is damaged, or the footage given is not that of its shot.
+        InputError: the result is damaged, or the footage given is not that of its shot, or would be overwritten.
     """
     text = report.read_text(encoding="utf-8")
     try:
@@ -33,6 +35,7 @@ def write_desk(report: Path, footage: Path | None = None) -> Path | None:
     if not data.get("positions"):  # nothing is solved, so there is nothing to pick
         return None
     result = read_result(report.parent)
+    spare_footage([report.with_name(DESK)], footage, *footage_of(result.options))
     retake(result, footage, _WIDTH)
     pictures = [frame.thumbnail for frame in result.frames]
     if not any(pictures):

@@ -16,9 +16,11 @@ from factorsfm.export.footage import frames_of
 from factorsfm.export.options import ExportOptions
 from factorsfm.export.shot import Defaults, Lens, make_shot
 from factorsfm.export.writing import complete_file
+from factorsfm.frames.targets import spare_footage
 from factorsfm.frames.video import count_frames
 from factorsfm.report.props import Props, place_props
 from factorsfm.report.wording import status_words
+from factorsfm.result.image_sources import footage_of
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.support.errors import InputError
 from factorsfm.support.progress import Progress
@@ -104,7 +106,7 @@ def write_overlay(
         What has been placed into the scene.
 
     Raises:
-        InputError: nothing has been written.
+        InputError: nothing has been written; the path may be that of the footage.
     """
     path = Path(path)
     if path.suffix.lower() not in CODECS:
@@ -116,6 +118,7 @@ def write_overlay(
     shot = make_shot(reconstruction, ExportOptions(footage=source), Defaults())
     if shot.footage is None:
         raise InputError("the source of this result is not where it was; say where the shot is")
+    spare_footage([path], source, *footage_of(reconstruction.options))
     # In its own world, at the size of the footage.
     reconstruction = replace(shot.reconstruction, alignment=reconstruction.alignment)
     props, projector = place_props(reconstruction), Projector.of(reconstruction)

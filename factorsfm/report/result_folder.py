@@ -14,7 +14,9 @@ from factorsfm.export.colmap import write_colmap
 from factorsfm.export.ply import write_ply
 from factorsfm.export.trajectory import write_trajectory
 from factorsfm.export.writing import exchanged, rename_all
+from factorsfm.frames.targets import spare_footage
 from factorsfm.report.page import failure_html, report_html
+from factorsfm.result.image_sources import footage_of
 from factorsfm.result.moving import moving_json
 from factorsfm.result.objects import objects_json
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
@@ -48,7 +50,7 @@ def write_folder(reconstruction: Reconstruction, directory: str | Path) -> None:
     Raises:
         InputError: the directory cannot be written, or holds something else than an earlier result.
     """
-    with _complete_or_nothing(Path(directory)) as folder:
+    with _complete_or_nothing(Path(directory), reconstruction.options) as folder:
         _write_files(reconstruction, folder)
         for number, other in enumerate(reconstruction.others, 2):
             (folder / part_name(number)).mkdir()
@@ -84,18 +86,22 @@ def write_failure(
     Raises:
         InputError: the directory cannot be written, or holds something else than an earlier result.
     """
-    with _complete_or_nothing(Path(directory)) as folder:
-        options, seconds = options or {}, seconds or {}
+    options, seconds = options or {}, seconds or {}
+    with _complete_or_nothing(Path(directory), options) as folder:
         (folder / "report.html").write_text(failure_html(reason, frames, options, seconds), encoding="utf-8")
         content = failure_summary(reason, frames, options, seconds)
         (folder / _SUMMARY).write_text(json_text(content), encoding="utf-8")
 
 
-def check_directory(directory: str | Path) -> None:
+def check_directory(directory: str | Path, *footage: object) -> None:
     """Find out before the long work whether a result can be written here; changes nothing.
 
+    Args:
+        footage: what must not be overwritten, see `spare_footage`.
+
     Raises:
-        InputError: the directory cannot be written, or holds something else than an earlier result.
+        InputError: the directory cannot be written, holds something else than an earlier result, or footage at the
+            place of its files.
     """
     directory = Path(directory)
     try:
@@ -109,6 +115,7 @@ def check_directory(directory: str | Path) -> None:
                 f"the output folder {directory} holds {min(foreign)}, which is no part of an earlier result; "
                 "choose another folder"
             )
+        spare_footage([directory / name for name in (_SUMMARY, *_ENTRIES, *_parts(directory))], *footage)
         existing = next(p for p in (directory, *directory.absolute().parents) if p.exists())
         with tempfile.TemporaryDirectory(prefix=f".{PROGRAM}-", dir=existing):
             pass
@@ -117,9 +124,13 @@ def check_directory(directory: str | Path) -> None:
 
 
 @contextmanager
-def _complete_or_nothing(directory: Path) -> Iterator[Path]:
-    """A folder to write into; its content becomes `directory` when the block ends without an error."""
-    check_directory(directory)
+def _complete_or_nothing(directory: Path, options: Mapping[str, Any]) -> Iterator[Path]:
+    """A folder to write into; its content becomes `directory` when the block ends without an error.
+
+    Args:
+        options: of the result, which name its footage.
+    """
+    check_directory(directory, *footage_of(options))
     existed = directory.exists()
     # Inside a directory that exists, since that may be a mount point or the working directory.
     place, prefix = (directory, _REPLACING) if existed else (directory.absolute().parent, f".{PROGRAM}-")

@@ -70,6 +70,15 @@ def image_sources(main: Path, options: Mapping[str, Any]) -> list[ImageSource]:
     ]
 
 
+def footage_of(options: Mapping[str, Any]) -> list[object]:
+    """Whatever a result with these options says that its images are from; not all of it needs to be a path.
+
+    Raises:
+        InputError: the options are damaged.
+    """
+    return [options.get("source"), *(part.source for part in added_images(options))]
+
+
 def fields_of(options: Mapping[str, Any]) -> Fields:
     """How the footage of a result with these options was read, see `read_frames`: its frames are counted so."""
     said = options.get("fields")

@@ -28,7 +28,7 @@ from factorsfm.support.errors import InputError
 from factorsfm.support.status import FrameStatus
 from factorsfm.tracks.image_tracks import ImageTracks
 
-_MAGIC = b"factorsfm-2\n"
+_MAGIC, _ANY_MAGIC = b"factorsfm-2\n", b"factorsfm-"
 _CHECKSUM_BYTES = 32
 _DTYPES = {"bool", "uint8", "int32", "int64", "uint64", "float32", "float64"}
 _TYPES: dict[str, Any] = {
@@ -41,8 +41,9 @@ def write_snapshot(path: Path, state: Mapping[str, Any]) -> None:
     """Write a state: nested dicts, lists, tuples, numbers, strings, arrays, cameras, and the estimator's own records.
 
     Raises:
-        InputError: the file cannot be written; an older one at its place is untouched.
+        InputError: the file cannot be written, or is something else than a snapshot; what is at its place is untouched.
     """
+    _check_replaceable(path)
     writer = _Writer()
     header = json.dumps(writer.packed(state)).encode()
     body = b"".join([_MAGIC, len(header).to_bytes(8, "little"), header, *writer.chunks])
@@ -59,6 +60,19 @@ def write_snapshot(path: Path, state: Mapping[str, Any]) -> None:
         if temporary is not None:
             temporary.unlink(missing_ok=True)
         raise InputError(f"snapshot {path} cannot be written: {error.strerror}") from error
+
+
+def _check_replaceable(path: Path) -> None:
+    """Refuse to replace a file that is no snapshot, such as the footage."""
+    if not path.is_file():
+        return
+    try:
+        with path.open("rb") as file:
+            begin = file.read(len(_ANY_MAGIC))
+    except OSError as error:
+        raise InputError(f"snapshot {path} cannot be written: {error.strerror}") from error
+    if begin and begin != _ANY_MAGIC:
+        raise InputError(f"snapshot {path} would overwrite a file that is no snapshot; choose another path")
 
 
 def read_snapshot(path: Path) -> dict[str, Any]:

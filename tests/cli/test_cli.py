@@ -1,5 +1,6 @@
 """Exit statuses, one-line errors and what each command hands on."""
 
+import io
 import json
 import logging
 from pathlib import Path
@@ -254,6 +255,44 @@ def test_warnings_that_say_the_same_are_counted(
             "WARNING factorsfm: 7 more like this: image 9.jpg is left out",
             "WARNING factorsfm.lens: 9 more like this: a guess",
         }
+
+
+@pytest.mark.parametrize("name", ["é ö", "plain"])
+def test_an_output_that_is_not_utf8_gets_escapes(
+    tmp_path: Path, calls: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.setattr("factorsfm.cli.command.conclusion", lambda *_: f"{name}: 1 ± 2")
+    written = io.BytesIO()
+    monkeypatch.setattr("sys.stdout", io.TextIOWrapper(written, "ascii"))
+    assert main(["reconstruct", "shot.mp4", "--output", str(tmp_path / name)]) == 0
+    assert written.getvalue().decode() == f"{name}: 1 ± 2\n".encode("ascii", "backslashreplace").decode()
+
+
+class Full(io.StringIO):
+    """A full disk."""
+
+    def write(self, text: str) -> int:
+        raise OSError(28, "No space left on device")
+
+
+def test_a_full_output_is_no_failure_of_the_work(
+    tmp_path: Path, calls: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["reconstruct", "shot.mp4", "--output", str(tmp_path / "out")]
+    monkeypatch.setattr("sys.stdout", Full())
+    assert main(command) == 0
+    assert (
+        capsys.readouterr().err == "factorsfm: done, but standard output cannot be written: No space left on device\n"
+    )
+    monkeypatch.setattr("sys.stderr", Full())
+    assert main(command) == 0
+    assert main(["export", str(tmp_path), "--format", "ply", "--output", str(tmp_path / "a.ply")]) == 2
+
+
+def test_closed_outputs(tmp_path: Path, calls: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stdout", None)
+    monkeypatch.setattr("sys.stderr", None)
+    assert main(["reconstruct", "shot.mp4", "--output", str(tmp_path / "out")]) == 0
 
 
 def test_interrupt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

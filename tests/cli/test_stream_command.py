@@ -182,6 +182,18 @@ def test_a_snapshot_that_cannot_be_written_does_not_end_the_stream(
     assert summary(tmp_path / "out")["registered"] == FRAMES
 
 
+@pytest.mark.parametrize("option", ["--snapshot", "--record"])
+def test_neither_snapshot_nor_recording_replaces_the_source(
+    tmp_path: Path, stream: Run, capsys: pytest.CaptureFixture[str], option: str
+) -> None:
+    source = write_images(tmp_path / "images", rendered("dolly").images[:2])
+    before = (source / "000001.png").read_bytes()
+    (tmp_path / "link").symlink_to(source)
+    assert stream(option, tmp_path / "link" / "000001.png", source=source) == 2
+    assert_error(capsys.readouterr(), "000001.png would overwrite the footage")
+    assert (source / "000001.png").read_bytes() == before
+
+
 def test_record(tmp_path: Path, stream: Run) -> None:
     pytest.importorskip("rerun")
     assert stream("--record", tmp_path / "shot.rrd") == 0

@@ -10,6 +10,7 @@ import pycolmap
 import pytest
 
 from factorsfm.export import ExportOptions, export
+from factorsfm.export.footage import image_sequence
 from factorsfm.frames.folders import read_pixels
 from factorsfm.frames.plates import read_exr
 from factorsfm.frames.reading import read_frames
@@ -86,6 +87,14 @@ def test_a_movie_behind_a_solved_sequence(tmp_path: Path) -> None:
     assert (plate["first"], plate["last"], plate["frame"]) == ("1", "21", "1033")
 
 
+def test_the_number_need_not_be_last_in_the_name(tmp_path: Path) -> None:
+    for number in range(1001, 1004):
+        (tmp_path / f"shot_{number}_v02.png").touch()
+    sequence = image_sequence(tmp_path)
+    assert Path(sequence.pattern) == tmp_path / "shot_%04d_v02.png"
+    assert (sequence.first, sequence.last) == (1001, 1003)
+
+
 def test_gaps_of_the_footage_are_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     footage = noise_images(tmp_path / "shot", 21)
     (footage / "shot.1005.png").unlink()
@@ -148,6 +157,29 @@ def test_nerfstudio_takes_images_and_lens_of_the_originals(tmp_path: Path) -> No
     assert (content["w"], content["h"], content["fl_x"], content["cy"]) == (1280, 960, 1200, 524)
     for entry in content["frames"]:
         assert cv2.imread(str(tmp_path / "out" / entry["file_path"])).shape == (960, 1280, 3)
+
+
+def test_neither_footage_nor_source_is_overwritten(tmp_path: Path) -> None:
+    source, other = movie(tmp_path / "shot.avi"), movie(tmp_path / "other.avi")
+    (tmp_path / "link.avi").symlink_to(source)
+    solved = replace(hard_reconstruction(), options={"source": str(source)})
+    before = source.read_bytes(), other.read_bytes()
+    for path in (source, tmp_path / "link.avi", other):
+        with pytest.raises(InputError, match="would overwrite the footage"):
+            write_overlay(solved, path, other)
+        with pytest.raises(InputError, match="would overwrite the footage"):
+            export(solved, path, format="ply", options=ExportOptions(footage=other))
+    assert (source.read_bytes(), other.read_bytes()) == before
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["link.avi", "other.avi", "shot.avi"]
+
+
+def test_plates_are_not_replaced_by_undistorted_ones(tmp_path: Path) -> None:
+    for number in range(1001, 1023):
+        cv2.imwrite(str(tmp_path / f"plate.{number}.png"), np.full((480, 640, 3), number - 1000, np.uint8))
+    solved = replace(numbered(), options={"first_number": 1001, "source": str(tmp_path)})
+    with pytest.raises(InputError, match="would overwrite the footage"):
+        export(solved, tmp_path, format="undistorted")
+    assert int(cv2.imread(str(tmp_path / "plate.1011.png"))[0, 0, 0]) == 11
 
 
 def test_overlay_on_the_originals(tmp_path: Path) -> None:

@@ -1,5 +1,7 @@
+import errno
 import itertools
 import logging
+import os
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
@@ -8,8 +10,10 @@ import cv2
 import numpy as np
 import pytest
 
+from factorsfm.batch.plan import find_videos
 from factorsfm.frames import container
 from factorsfm.frames import video as video_files
+from factorsfm.frames.folders import read_image
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.ranges import parse_range
 from factorsfm.frames.reading import read_frames
@@ -245,6 +249,28 @@ def test_file_that_is_no_video_is_refused_at_the_call(tmp_path, content, capfd):
     assert capfd.readouterr().err == ""
 
 
+def test_what_is_neither_file_nor_folder_is_said_to_be_so(tmp_path):
+    os.mkfifo(tmp_path / "pipe.mp4")
+    for path in (tmp_path / "pipe.mp4", Path(os.devnull)):
+        for read in (read_frames, find_videos):
+            with pytest.raises(InputError, match=f"{path} is neither a file nor a folder; a video file or a folder of"):
+                read(path)
+
+
+def test_a_video_that_cannot_be_opened_is_not_said_to_be_damaged(tmp_path, monkeypatch):
+    path = tmp_path / "shot.mp4"
+    with pytest.raises(InputError, match=r"shot\.mp4 cannot be read: No such file or directory"):
+        video_files.open_video(path)
+    path.write_bytes(b"locked")
+
+    def locked(*_: object) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "open", locked)
+    with pytest.raises(InputError, match=r"shot\.mp4 cannot be read: Permission denied"):
+        read_frames(path)
+
+
 def test_pixels_of_another_type_are_named(tmp_path):
     cv2.imwrite(str(tmp_path / "0.tif"), image(50).astype(np.float64))
     with pytest.raises(InputError, match=r"0\.tif has pixels of float64; 8 or 16 bits a channel"):
@@ -304,6 +330,73 @@ def test_jpeg_with_thumbnail_or_trailing_data_is_complete(tmp_path):
     path.write_bytes(jpeg[:2] + thumbnail + jpeg[2:-40])
     with pytest.raises(InputError, match="truncated"):
         next(read_frames(tmp_path))
+
+
+def with_hole(data: bytes, share: float) -> bytes:
+    """The same file with zeros from its middle on."""
+    middle, size = len(data) // 2, int(share * len(data))
+    return data[:middle] + bytes(size) + data[middle + size :]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        [],
+        [cv2.IMWRITE_JPEG_OPTIMIZE, 1],
+        [cv2.IMWRITE_JPEG_PROGRESSIVE, 1],
+        [cv2.IMWRITE_JPEG_RST_INTERVAL, 4],
+        [cv2.IMWRITE_JPEG_QUALITY, 30],
+    ],
+)
+@pytest.mark.parametrize("share", [0.1, 0.25])
+def test_a_jpeg_with_a_hole_is_damaged(tmp_path, options, share, capfd):
+    picture = cv2.GaussianBlur(RNG.integers(0, 255, (480, 640, 3), dtype=np.uint8), (0, 0), 2)
+    data = cv2.imencode(".jpg", picture, options)[1].tobytes()
+    path = tmp_path / "a.jpg"
+    path.write_bytes(data)
+    assert read_image(path).shape == picture.shape
+    path.write_bytes(with_hole(data, share))
+    with pytest.raises(InputError, match=r"image .*a\.jpg is damaged"):
+        read_image(path)
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("value", [0, 128, 255])
+@pytest.mark.parametrize(
+    "options",
+    [
+        [],
+        [cv2.IMWRITE_JPEG_OPTIMIZE, 1],
+        [cv2.IMWRITE_JPEG_PROGRESSIVE, 1],
+        [cv2.IMWRITE_JPEG_RST_INTERVAL, 4, cv2.IMWRITE_JPEG_OPTIMIZE, 1],
+    ],
+)
+def test_a_jpeg_of_one_colour_or_with_padding_is_whole(tmp_path, value, options):
+    """Optimal codes of an image of one colour are all zeros, and a scan may be filled up."""
+    path = tmp_path / "a.jpg"
+    data = cv2.imencode(".jpg", image(value, 640, 480), options)[1].tobytes()
+    path.write_bytes(data)
+    np.testing.assert_allclose(read_image(path), value, atol=1)
+    path.write_bytes(data[:-2] + bytes(500) + data[-2:] + bytes(500))
+    np.testing.assert_allclose(read_image(path), value, atol=1)
+
+
+def test_a_marker_that_no_scan_holds_is_damage(tmp_path):
+    data = cv2.imencode(".jpg", RNG.integers(0, 255, (48, 64, 3), dtype=np.uint8))[1].tobytes()
+    middle = len(data) // 2
+    (tmp_path / "a.jpg").write_bytes(data[:middle] + b"\xff\x07" + data[middle + 2 :])
+    with pytest.raises(InputError, match=r"image .*a\.jpg is damaged"):
+        read_image(tmp_path / "a.jpg")
+
+
+def test_a_png_with_a_hole_is_damaged(tmp_path, capfd):
+    data = cv2.imencode(".png", RNG.integers(0, 255, (48, 64, 3), dtype=np.uint8))[1].tobytes()
+    (tmp_path / "a.png").write_bytes(with_hole(data, 0.1))
+    with pytest.raises(InputError, match=r"image .*a\.png is damaged"):
+        read_image(tmp_path / "a.png")
+    text = b"tEXtComment\0x"  # a wrong checksum of what nobody needs
+    (tmp_path / "a.png").write_bytes(data[:33] + (len(text) - 4).to_bytes(4, "big") + text + bytes(4) + data[33:])
+    assert read_image(tmp_path / "a.png").shape == (48, 64, 3)
 
 
 def test_other_size_is_named(tmp_path):

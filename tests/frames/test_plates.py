@@ -13,8 +13,9 @@ from factorsfm.frames.folders import read_image, read_pixels, stated_pixel_aspec
 from factorsfm.frames.numbering import missing_numbers, numbered_images, sequence_of
 from factorsfm.frames.ranges import parse_range
 from factorsfm.frames.reading import read_frames
-from factorsfm.frames.sequences import sequence_numbers
+from factorsfm.frames.sequences import mixture, sequence_numbers
 from factorsfm.frames.tone import eight_bits, tone_curve
+from factorsfm.frames.unordered import looks_unordered
 from factorsfm.support.errors import InputError
 
 WIDTH, HEIGHT = 96, 64
@@ -88,17 +89,21 @@ def test_damaged_plates_are_named(tmp_path):
         read_image(tmp_path / "e.exr")
 
 
-def test_damaged_plates_say_nothing_on_standard_error(tmp_path, capfd):
+def test_damaged_plates_say_nothing_on_standard_output_and_error(tmp_path, capfd):
     write_exr(tmp_path / "a.exr", {"RGB": colors(np.float16, 1)})
     data = (tmp_path / "a.exr").read_bytes()
     for share in (0.1, 0.5, 0.99):
         (tmp_path / "a.exr").write_bytes(data[: int(share * len(data))])
         with pytest.raises(InputError, match=r"a\.exr cannot be decoded"):
             read_image(tmp_path / "a.exr")
-    assert capfd.readouterr().err == ""
+    middle = len(data) // 2
+    (tmp_path / "a.exr").write_bytes(data[:middle] + bytes(middle // 4) + data[middle + middle // 4 :])
+    with pytest.raises(InputError, match=r"a\.exr cannot be decoded"):
+        read_image(tmp_path / "a.exr")
+    assert capfd.readouterr() == ("", "")
 
 
-def test_pixel_aspect_of_plates(tmp_path):
+def test_pixel_aspect_of_plates(tmp_path, caplog):
     write_exr(tmp_path / "a.1.exr", {"RGB": colors(np.float16, 1)}, pixelAspectRatio=2.0)
     assert next(read_frames(tmp_path)).pixel_aspect == 2.0
     assert next(read_frames(tmp_path, pixel_aspect=1.5)).pixel_aspect == 1.5
@@ -106,6 +111,11 @@ def test_pixel_aspect_of_plates(tmp_path):
         for aspect, expected in (((4, 3), 4 / 3), ((0, 1), 1.0), ((2**32 - 1, 2**32 - 1), 1.0)):
             (tmp_path / "a.dpx").write_bytes(magic + bytes(1624) + struct.pack(f"{order}2I", *aspect))
             assert stated_pixel_aspect(tmp_path / "a.dpx") == pytest.approx(expected)
+    assert caplog.text == ""
+    (tmp_path / "a.dpx").write_bytes(b"SDPX" + bytes(1624) + struct.pack(">2I", 1, 100))
+    write_exr(tmp_path / "a.1.exr", {"RGB": colors(np.float16, 1)}, pixelAspectRatio=100.0)
+    assert stated_pixel_aspect(tmp_path / "a.dpx") == stated_pixel_aspect(tmp_path / "a.1.exr") == 1.0
+    assert caplog.text.count("which is ignored; 0.25 to 4 is expected") == 2
     (tmp_path / "a.dpx").write_bytes(b"SDPX")
     assert stated_pixel_aspect(tmp_path / "a.dpx") == 1.0
 
@@ -177,6 +187,13 @@ def test_tone_curve_spends_the_same_levels_on_every_stop():
         (["1305031102.175304.png", "1305031103.211214.png"], None),  # seconds
         (["a.1.png", "b.2.png"], None),
         (["a.01.png", "a.1.png"], None),
+        (["plate_1001_v02.png", "plate_1002_v02.png"], [1001, 1002]),
+        (["plate.0999.left.exr", "plate.1000.left.EXR"], [999, 1000]),
+        (["1_b.png", "2_b.png", "10_b.png"], [1, 2, 10]),
+        (["plate_1001_v02.png"], [1001]),
+        (["clip1_v0001.png"], [1]),
+        (["plate_v02.png"], [2]),
+        (["a1_1.png", "a2_2.png"], None),
         (["cover.png"], None),
         ([], None),
     ],
@@ -232,6 +249,47 @@ def test_gaps_of_a_sequence_are_named(sequence):
     assert missing_numbers([1, 3, 5]) == missing_numbers([4]) == missing_numbers([]) == ""
     assert missing_numbers(range(0, 80, 10)) == ""
     assert missing_numbers([2 * k + 100 * (k // 3) for k in range(24)]).endswith(" and 2 more gaps")
+
+
+@pytest.mark.parametrize(
+    ("added", "words"),
+    [
+        (["plate.1012.jpg"], r"plate\.1012\.jpg beside the sequence plate\.####\.png"),
+        (["cover.png", "notes.tif"], r"cover\.png and 1 more files beside the sequence plate\.####\.png"),
+        ([f"plate.{k}.jpg" for k in range(1001, 1012)], r"2 sequences \(plate\.####\.jpg, plate\.####\.png\)"),
+        ([f"plate.{k:05d}.png" for k in range(1001, 1013)], r"2 sequences \(plate\.#####\.png, plate\.####\.png\)"),
+        ([f"R.{k}.png" for k in range(1, 9)], r"2 sequences \(R\.#\.png, plate\.####\.png\)"),
+        ([f"plate.{k}.left.png" for k in (1001, 1002)], r"2 sequences \(plate\.####\.left\.png, plate\.####\.png\)"),
+        ([f"{k}.{n}.png" for k in "abc" for n in (1, 2)], r"4 sequences \(a\.#\.png, b\.#\.png, c\.#\.png, \.\.\.\)"),
+    ],
+)
+def test_a_folder_with_more_than_a_sequence_is_refused(sequence, added, words):
+    for name in added:
+        cv2.imwrite(str(sequence / name), np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    with pytest.raises(InputError, match=f"holds {words}; a folder with one of them is expected"):
+        read_frames(sequence)
+
+
+def test_two_paddings_of_the_same_numbers_are_two_sequences():
+    names = [name for k in range(1, 25) for name in (f"frame{k}.png", f"frame{k:04d}.png")]
+    assert mixture(names) == "2 sequences (frame####.png, frame#.png)"
+    assert mixture([f"frame{k}.png" for k in range(1, 25)]) == mixture(["b.png", "a.png"]) == ""
+
+
+@pytest.mark.parametrize("numbers", [(-4, -3, -2), (-1, 0, 1, 2), (-1,)])
+@pytest.mark.parametrize("prefix", ["plate.", "plate_", ""])
+def test_negative_numbers_are_refused(tmp_path, prefix, numbers):
+    for number in numbers:
+        cv2.imwrite(str(tmp_path / f"{prefix}{number:05d}.png"), np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    for read in (read_frames, looks_unordered):
+        with pytest.raises(InputError, match=rf"negative numbers \({prefix}-000\d\.png\); numbers from 0 on"):
+            read(tmp_path)
+
+
+def test_a_hyphen_before_a_number_is_no_minus(tmp_path):
+    for number in (1001, 1002):
+        cv2.imwrite(str(tmp_path / f"plate-{number}.png"), np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    assert [frame.index for frame in read_frames(tmp_path)] == [1001, 1002]
 
 
 def test_two_sequences_in_a_folder_are_refused(sequence):

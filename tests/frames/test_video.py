@@ -446,6 +446,14 @@ def test_pixel_aspect_of_the_container_and_of_the_user(tmp_path):
     assert next(read_frames(path, pixel_aspect=1.5, fields="apart")).pixel_aspect == 0.75
 
 
+@pytest.mark.parametrize("aspect", [Fraction(1, 100), Fraction(9, 2)])
+def test_a_pixel_aspect_that_no_footage_has_is_ignored(tmp_path, caplog, aspect):
+    path = write_video(tmp_path / "shot.mkv", moving_texture(2), aspect=aspect)
+    assert {frame.pixel_aspect for frame in read_frames(path)} == {1.0}
+    said = f"states a pixel aspect of {float(aspect):g}, which is ignored; 0.25 to 4 is expected"
+    assert said in caplog.text
+
+
 # --- colour -------------------------------------------------------------------------------------------------------
 
 

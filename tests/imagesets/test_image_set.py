@@ -590,6 +590,42 @@ def test_sets_and_shots_are_told_apart(shot: RenderedShot, tmp_path: Path) -> No
     assert other_files(tmp_path / "single") == ["b.txt"]
 
 
+@pytest.mark.parametrize(
+    ("names", "others", "words"),
+    [
+        ("plate.%04d.png", ["plate.0003.jpg"], r"plate\.0003\.jpg beside the sequence plate\.####\.png"),
+        ("plate.%04d.png", [f"plate.{k:04d}.jpg" for k in range(7)], "2 sequences"),
+        ("L.%04d.png", [f"R.{k:04d}.png" for k in range(8)], r"2 sequences \(L\.####\.png, R\.####\.png\)"),
+        ("IMG_%04d.JPG", [f"DSC_{k:04d}.JPG" for k in range(8)], ""),
+        ("IMG_%04d.JPG", ["cover.jpg"], ""),
+    ],
+)
+def test_what_is_mixed_into_a_shot_is_refused(
+    shot: RenderedShot, tmp_path: Path, names: str, others: list[str], words: str
+) -> None:
+    """Photographs that share as much, with the names of cameras, are still a set; and so is what shares too little."""
+    moved = [np.roll(shot.images[0], (2 * k, 3 * k), (0, 1)) for k in range(8)]
+    for folder, images in (("shot", moved), ("set", [cv2.rotate(i, k % 3) for k, i in enumerate(moved)])):
+        (tmp_path / folder).mkdir()
+        for k, image in enumerate(images):
+            cv2.imwrite(str(tmp_path / folder / (names % k)), image)
+        for k, name in enumerate(others):
+            cv2.imwrite(str(tmp_path / folder / name), images[k])
+    assert looks_unordered(tmp_path / "set")
+    if not words:
+        assert looks_unordered(tmp_path / "shot")
+        return
+    with pytest.raises(InputError, match=f"holds {words}.*; a folder with one of them is expected, unless"):
+        reconstruct(tmp_path / "shot", depth=None)
+
+
+def test_a_number_in_the_middle_of_the_names_is_that_of_the_frame(shot: RenderedShot, tmp_path: Path) -> None:
+    for k in range(4):
+        cv2.imwrite(str(tmp_path / f"plate_{1001 + k}_v02.png"), np.roll(shot.images[0], (2 * k, 3 * k), (0, 1)))
+    assert not looks_unordered(tmp_path)
+    assert [frame.index for frame in read_images(tmp_path, numbered=True)] == [1001, 1002, 1003, 1004]
+
+
 @pytest.mark.slow
 def test_two_real_scenes_in_one_folder(shared_data: Path, tmp_path: Path) -> None:
     """The photographs of both were taken with one lens."""

@@ -208,6 +208,21 @@ def test_killed_while_it_writes_into_an_empty_folder_it_leaves_one_that_counts_a
     assert {path.name for path in tmp_path.iterdir()} == FILES
 
 
+def test_footage_at_the_place_of_a_part_stays(folder: Path) -> None:
+    for name in ("part-002", "mine"):
+        (folder / name / "shot.mp4").write_text("footage")
+    lost = replace(build(points=9), options={"source": str(folder / "part-002" / "shot.mp4")})
+    for call in (
+        lambda: lost.write(folder),
+        lambda: check_directory(folder, folder / "part-002" / "shot.mp4"),
+        lambda: write_failure(folder, NEW, options=lost.options),
+    ):
+        with pytest.raises(InputError, match="part-002 would overwrite the footage"):
+            call()
+    replace(lost, options={"source": str(folder / "mine" / "shot.mp4")}).write(folder)
+    assert (folder / "mine" / "shot.mp4").read_text() == "footage"
+
+
 def test_a_folder_of_the_user_is_not_taken_for_a_part(folder: Path) -> None:
     (folder / "part-004").mkdir()
     (folder / "part-004" / "precious.txt").write_text("x")

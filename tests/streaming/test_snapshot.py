@@ -227,6 +227,18 @@ def test_files_that_cannot_be_read_or_written(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_file_that_is_no_snapshot_is_not_replaced(tmp_path):
+    (tmp_path / "shot.mp4").write_bytes(b"footage")
+    with pytest.raises(InputError, match="would overwrite a file that is no snapshot"):
+        write_snapshot(tmp_path / "shot.mp4", {})
+    assert (tmp_path / "shot.mp4").read_bytes() == b"footage"
+    (tmp_path / "older").write_bytes(b"factorsfm-1\n...")
+    (tmp_path / "empty").touch()
+    for name in ("older", "empty", "new"):
+        write_snapshot(tmp_path / name, {"a": 1})
+        assert read_snapshot(tmp_path / name) == {"a": 1}
+
+
 def test_values_survive(tmp_path):
     state = {
         "none": None, "number": 1, "real": 0.1, "nan": float("nan"), "text": "Größe", "truth": True,
