@@ -205,14 +205,14 @@ def write_after_effects_tracks(shot: Shot, path: Path) -> None:
     """Write a script for After Effects that makes a null with keyframes of each track in the open composition.
 
     The nulls lie on the footage, with its distortion, as the format `after-effects` places it: with the optical axis
-    in the middle of the composition, and square pixels.
+    in the middle of the composition, and square pixels. Times are seconds, of the frames that its keyframes have.
     """
     lens = shot.lens
     middle = np.array([lens.width / 2, lens.height / 2])
     tracks = [
         {
             "name": track.name,
-            "times": ((track.numbers - shot.first_frame) / shot.fps).tolist(),
+            "times": (track.numbers / shot.fps).tolist(),
             "places": (middle + (track.xy - [lens.cx, lens.cy]) / [1.0, lens.pixel_aspect]).tolist(),
         }
         for track in tracks_of(shot)

@@ -4,6 +4,7 @@ import csv
 import json
 import re
 import types
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import pytest
 from factorsfm.export import ExportOptions, export
 from tests.exact_result import build
 from tests.export_problems import noise_images
+from tests.exported_files import after_effects_tracks
 
 FIRST = 1001
 HEIGHT, WIDTH = 480, 640
@@ -103,8 +105,24 @@ def test_after_effects(tmp_path: Path) -> None:
         for time, (x, y) in zip(track["times"], track["places"], strict=True):
             # As its footage is placed: the optical axis in the middle, pixels square.
             place = [x - WIDTH / 2 + 321, (y - HEIGHT / 2) * 510 / 500 + 239]
-            found[track["name"], FIRST + round(25 * time)] = place
+            found[track["name"], round(25 * time)] = place
     compare(found, slice(2))
+
+
+@pytest.mark.parametrize("first_frame", [None, 0, 86400])
+def test_after_effects_has_camera_and_tracks_at_the_same_times(tmp_path: Path, first_frame: int | None) -> None:
+    """Also of a numbered sequence, which both count from the start of the composition."""
+    result = build()
+    frames = [replace(frame, index=1001 + k) for k, frame in enumerate(result.frames)]
+    result = replace(result, frames=frames, options={"first_number": 1001})
+    options = ExportOptions(first_frame=first_frame, fps=25)
+    export(result, tmp_path / "camera", format="after-effects", options=options)
+    export(result, tmp_path / "tracks.jsx", format="tracks-after-effects", options=options)
+    _, camera = after_effects_tracks((tmp_path / "camera" / "camera.txt").read_text())
+    keys = list(camera["Transform\tPosition"])
+    assert keys == [(first_frame or 0) + k for k in (0, 1, 2, 4, 5)]
+    for track in json.loads(re.findall(r"var DATA = (.*);\n", (tmp_path / "tracks.jsx").read_text())[0])["tracks"]:
+        np.testing.assert_allclose(track["times"], np.array(keys) / 25, rtol=1e-12)
 
 
 def test_blender(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
