@@ -33,8 +33,11 @@ _PATTERN, _SEARCH = "-12 -12 12 12", "-24 -24 24 24"  # areas of a track around 
 _BLENDER = """
 import bpy
 
-# Without footage the tracks are for the clip that is open.
-clip = bpy.data.movieclips.load(DATA["footage"]) if DATA["footage"] else bpy.data.movieclips[0]
+if DATA["footage"]:
+    clip = bpy.data.movieclips.load(DATA["footage"])
+    clip.frame_start = DATA["frame_start"]
+else:
+    clip = bpy.data.movieclips[0]  # the tracks are for the clip that is open
 for name, frames, places in DATA["tracks"]:
     track = clip.tracking.tracks.new(name=name, frame=frames[0])
     for k, (frame, place) in enumerate(zip(frames, places)):
@@ -182,21 +185,22 @@ def write_camera_tracker_tracks(shot: Shot, path: Path) -> None:
 def write_blender_tracks(shot: Shot, path: Path) -> None:
     """Write a script for Blender that loads the footage as a movie clip and gives it the tracks, as markers.
 
-    Markers lie on the footage, with its distortion, in frames of the clip, whose first one is 1. Where there is no
-    footage, the tracks are for the clip that is open.
+    Markers lie on the footage, with its distortion, in frames of the clip, whose first one is 1; the clip begins in the
+    scene at the number of its first frame. Where there is no footage, the tracks are for the clip that is open.
 
     Raises:
         InputError: the footage is a folder whose images are not a numbered sequence.
     """
     footage = background(shot)
     file = footage.file(footage.first) if isinstance(footage, Sequence) else footage
-    first, size = shot.footage_start - 1, np.array([shot.lens.width, shot.lens.height])
+    start, size = shot.footage_start, np.array([shot.lens.width, shot.lens.height])
     tracks = []
     for track in tracks_of(shot):
         places = track.xy / size
         places[:, 1] = 1.0 - places[:, 1]
-        tracks.append((track.name, (track.numbers - first).tolist(), np.round(places, 9).tolist()))
-    text = json.dumps({"footage": file and file.as_posix(), "tracks": tracks}, allow_nan=False)
+        tracks.append((track.name, (track.numbers - start + 1).tolist(), np.round(places, 9).tolist()))
+    data = {"footage": file and file.as_posix(), "frame_start": start, "tracks": tracks}
+    text = json.dumps(data, allow_nan=False)
     title = '"""Gives a movie clip in Blender the tracks of a factorsfm reconstruction."""'
     path.write_text(f"{title}\n\nimport json\n\nDATA = json.loads({text!r})\n{_BLENDER}", encoding="utf-8")
 

@@ -15,6 +15,7 @@ import pycolmap
 import pytest
 from numpy.typing import NDArray
 
+from factorsfm.cli.main import main
 from factorsfm.export import FORMATS, ExportOptions, export
 from factorsfm.support.errors import InputError
 from tests.export_problems import (
@@ -88,6 +89,30 @@ def test_tum_in_evo(tmp_path: Path) -> None:
 def test_tum_times_follow_a_given_frame_rate(tmp_path: Path) -> None:
     export(hard_reconstruction(), tmp_path / "t.txt", format="tum", options=ExportOptions(fps=20))
     np.testing.assert_allclose(np.loadtxt(tmp_path / "t.txt")[:, 0], [0.5, 0.6, 0.7, 0.9, 1.0], atol=1e-9)
+
+
+def test_tum_times_follow_a_given_first_frame(tmp_path: Path) -> None:
+    numbers = np.array([10, 12, 14, 18, 20])
+    export(hard_reconstruction(), tmp_path / "t.txt", format="tum", options=ExportOptions(first_frame=500, fps=20))
+    np.testing.assert_allclose(np.loadtxt(tmp_path / "t.txt")[:, 0], (500 + numbers) / 20, atol=1e-9)
+    export(hard_reconstruction(), tmp_path / "t.txt", format="tum", options=ExportOptions(first_frame=0))
+    times = np.loadtxt(tmp_path / "t.txt")[:, 0]
+    timed = [frame.timestamp for frame in hard_reconstruction().registered]  # at 48 frames a second, from 0 on
+    np.testing.assert_allclose(times, numbers / 48, atol=1e-9)
+    assert np.abs(times - timed).min() > 0.1
+
+
+@pytest.mark.parametrize(("options", "told"), [([], False), (["--fps", "25"], True), (["--first-frame", "0"], True)])
+def test_tum_keeps_uneven_times_or_says_that_it_does_not(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], told: bool
+) -> None:
+    reconstruction = hard_reconstruction()
+    for k, frame in enumerate(reconstruction.frames):
+        frame.timestamp = 0.04 * frame.index + 0.04 * (k > 2)
+    reconstruction.write(tmp_path / "result")
+    command = ["export", str(tmp_path / "result"), "--format", "tum", "--output", str(tmp_path / "t.txt")]
+    assert main([*command, *options]) == 0
+    assert ("its frames come at uneven times" in capsys.readouterr().out) == told
 
 
 def test_kitti_in_evo_and_the_gap(tmp_path: Path) -> None:
@@ -531,6 +556,24 @@ def test_every_format_is_all_or_nothing_and_replaces_itself(
         with pytest.raises(InputError, match=r"cannot write the output .*: No space left on device"):
             export(hard_reconstruction(), target, format=format, options=options)
     assert {p: p.read_bytes() for p in place.rglob("*") if p.is_file()} == before
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_the_first_frame_counts_where_the_docs_say_so(tmp_path: Path, format: str) -> None:
+    for module in {"usd": ["pxr"], "alembic": ["alembic3d"]}.get(format, []):
+        pytest.importorskip(module)
+    table = (Path(__file__).parents[2] / "docs" / "export.md").read_text()
+    (said,) = re.findall(rf"^\| `{format}` \|.*\| (\S+) \|$", table, re.MULTILINE)
+    footage = noise_images(tmp_path / "shot", 1) if format in ("undistorted", "tracks-blender") else None
+    written = []
+    for first_frame in (0, 500):
+        path = path_of(format, tmp_path / str(first_frame))
+        export(
+            hard_reconstruction(), path, format=format, options=ExportOptions(first_frame=first_frame, footage=footage)
+        )
+        files = [file for file in sorted(path.parent.rglob("*")) if file.is_file()]
+        written.append({file.relative_to(path.parent): file.read_bytes() for file in files})
+    assert (written[0] != written[1]) == (said != "–")
 
 
 @pytest.mark.parametrize(

@@ -144,8 +144,9 @@ def test_blender(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data = types.SimpleNamespace(movieclips=types.SimpleNamespace(load=lambda path: clip))
     monkeypatch.setitem(__import__("sys").modules, "bpy", types.SimpleNamespace(data=data))
     exec(compile(script, "tracks.py", "exec"), {})
+    assert clip.frame_start == FIRST  # where frame 1 of the clip is shown
     found = {
-        (name, FIRST - 1 + number): [marker.co[0] * WIDTH, (1 - marker.co[1]) * HEIGHT]
+        (name, clip.frame_start - 1 + number): [marker.co[0] * WIDTH, (1 - marker.co[1]) * HEIGHT]
         for name, mine in markers.items()
         for number, marker in mine.items()
         if not marker.mute
