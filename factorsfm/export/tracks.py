@@ -140,11 +140,12 @@ def write_nuke_tracks(shot: Shot, path: Path) -> None:
     """Write a script with one Tracker4 node, for the undistorted plate of the format `nuke`.
 
     Pixels from the bottom left corner. A curve has keys in the frames of its track alone, and the track is enabled
-    from its first to its last frame.
+    from its first to its last frame. Signs of a name that Nuke does not take become underscores.
     """
     tracks = list(tracks_of(shot))
+    names = _nuke_names([track.name for track in tracks])
     columns = "\n".join(f"{{ {column} }}" for column in _NUKE_COLUMNS)
-    rows = "\n".join(_nuke_row(track, shot.lens.height) for track in tracks)
+    rows = "\n".join(_nuke_row(name, track, shot.lens.height) for name, track in zip(names, tracks, strict=True))
     path.write_text(
         f"Tracker4 {{\n inputs 0\n tracks {{ {{ 1 {len(_NUKE_COLUMNS)} {len(tracks)} }}\n{{ {columns}\n}}\n"
         f"{{\n{rows}\n}}\n}}\n name Tracks\n}}\n",
@@ -152,14 +153,25 @@ def write_nuke_tracks(shot: Shot, path: Path) -> None:
     )
 
 
-def _nuke_row(track: Track, height: int) -> str:
+def _nuke_names(names: list[str]) -> list[str]:
+    """Names that Nuke takes, each once."""
+    taken, found = {*names}, []
+    for name in names:
+        new = _NOT_IN_NUKE.sub("_", name)
+        while new != name and new in taken:
+            new += "_"
+        taken.add(new)
+        found.append(new)
+    return found
+
+
+def _nuke_row(name: str, track: Track, height: int) -> str:
     numbers = track.numbers.tolist()
     first, last = numbers[0], numbers[-1]
     curves = [
         " ".join(["curve", *(f"x{number} {value:.6f}" for number, value in zip(numbers, values, strict=True))])
         for values in (track.undistorted[:, 0].tolist(), (height - track.undistorted[:, 1]).tolist())
     ]
-    name = _NOT_IN_NUKE.sub("_", track.name)
     enabled, still = f"{{curve K x{first} 1 x{last + 1} 0}}", f"{{curve K x{first} 0}}"
     empty = " ".join(["{}"] * 11)
     return (

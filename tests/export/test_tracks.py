@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 
 from factorsfm.export import ExportOptions, export
+from factorsfm.mending.user_tracks import read_tracks
+from factorsfm.result.reconstruction import Reconstruction
 from tests.exact_result import build
 from tests.export_problems import noise_images
 from tests.exported_files import after_effects_tracks
@@ -95,6 +97,19 @@ def test_nuke_tracks_lie_on_the_undistorted_plate(tmp_path: Path) -> None:
             assert number == same
             found[name, int(number)] = [float(value), HEIGHT - float(other)]
     compare(found, slice(2, 4), 1e-5)
+
+
+def test_nuke_tracks_keep_different_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where they differ in signs alone that Nuke does not take."""
+    others = [f"other {k}" for k in range(35)]
+    monkeypatch.setattr(Reconstruction, "track_names", lambda _: ["a[1]", "a{1}", "a_1_", "$", "b c", *others])
+    written(tmp_path, "tracks-nuke")
+    found = read_tracks(tmp_path / "out", first_frame=FIRST).tracks
+    assert [track.name for track in found] == ["a_1__", "a_1___", "a_1_", "_", "b c", *others]
+    truth = expected()
+    for number, track in enumerate(found, 101):
+        flat = [truth[f"track_{number:05d}", FIRST + frame][2:] for frame in track.frames.tolist()]
+        np.testing.assert_allclose(track.xy * [1, -1] + [0.5, HEIGHT], flat, atol=1e-5)
 
 
 def test_after_effects(tmp_path: Path) -> None:
