@@ -340,6 +340,39 @@ def test_after_effects_projects_as_pycolmap(tmp_path: Path) -> None:
     assert_same_cameras(film, true_world_from_film(reconstruction, "-y", 100.0))
 
 
+# Blender, whose limits are those of its own properties; tests/export/test_blender.py runs the script in it
+
+
+@pytest.mark.parametrize(
+    ("rate", "whole"), [(0.001, 1), (0.4, 1), (0.5, 1), (1.4, 1), (30000 / 1001, 30), (1e6, 32767)]
+)
+def test_blender_takes_every_frame_rate(tmp_path: Path, rate: float, whole: int) -> None:
+    export(hard_reconstruction(), tmp_path / "a.py", format="blender", options=ExportOptions(fps=rate))
+    ((fps, base),) = re.findall(r'"fps": \[(\d+), ([^]]+)\]', (tmp_path / "a.py").read_text())
+    assert int(fps) == whole
+    assert int(fps) / float(base) == pytest.approx(rate, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"first_frame": -11}, "the numbers -1 to 9, and Blender has 0 to 1048574; another first frame"),
+        ({"first_frame": 1048555}, "the numbers 1048565 to 1048575, and Blender has 0 to 1048574"),
+        ({"sensor_width": 1.06}, "0.994 mm on a sensor of 1.06 mm, and Blender has 1 mm and more; a larger sensor"),
+    ],
+)
+def test_blender_is_not_given_what_it_would_change(tmp_path: Path, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        export(hard_reconstruction(), tmp_path / "a.py", format="blender", options=ExportOptions(**options))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("options", [{"first_frame": -10}, {"first_frame": 1048554}, {"sensor_width": 1.07}])
+def test_blender_is_given_all_that_it_takes(tmp_path: Path, options: dict[str, Any]) -> None:
+    export(hard_reconstruction(), tmp_path / "a.py", format="blender", options=ExportOptions(**options))
+    assert (tmp_path / "a.py").exists()
+
+
 # USD and Alembic
 
 
