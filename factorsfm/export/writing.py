@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from factorsfm.support.errors import InputError
+from factorsfm.support.output_files import kind_of, replaced_file
 from factorsfm.support.program import PROGRAM
 
 
@@ -16,16 +17,20 @@ from factorsfm.support.program import PROGRAM
 def complete_file(path: Path) -> Iterator[Path]:
     """Yields a temporary path to write; the file moves to `path` when the block ends without an error.
 
-    An earlier file is replaced.
+    An earlier file is replaced; of a link, the file that it leads to.
 
     Raises:
-        InputError: it cannot be written.
+        InputError: it cannot be written, or is something else than a file.
     """
     if path.is_dir():
         raise InputError(f"the output {path} is a folder; this format is one file")
-    with _temporary_beside(path) as folder:
+    try:
+        target = replaced_file(path)
+    except OSError as error:
+        raise _unwritable(path, error) from error
+    with _temporary_beside(target) as folder:
         yield folder / path.name
-        (folder / path.name).replace(path)
+        (folder / path.name).replace(target)
 
 
 @contextmanager
@@ -39,8 +44,8 @@ def complete_folder(path: Path) -> Iterator[Path]:
         InputError: it cannot be written, or it holds something else.
     """
     path = path.absolute()
-    if path.exists() and not path.is_dir():
-        raise InputError(f"the output {path} is a file; this format is a folder")
+    if (kind := kind_of(path)) not in (None, "a folder"):
+        raise InputError(f"the output {path} is {kind}; this format is a folder")
     with _temporary_beside(path) as temporary:
         folder = temporary / path.name  # a plain mkdir honours the umask, the temporary folder does not
         folder.mkdir()
@@ -89,4 +94,8 @@ def _temporary_beside(path: Path) -> Iterator[Path]:
         with tempfile.TemporaryDirectory(prefix=f".{PROGRAM}-", dir=place) as folder:
             yield Path(folder)
     except OSError as error:
-        raise InputError(f"cannot write the output {path}: {error.strerror or error}") from error
+        raise _unwritable(path, error) from error
+
+
+def _unwritable(path: Path, error: OSError) -> InputError:
+    return InputError(f"cannot write the output {path}: {error.strerror or error}")

@@ -23,6 +23,7 @@ from factorsfm.result.tracks_file import write_tracks
 from factorsfm.support.errors import InputError
 from factorsfm.support.json_reading import read_json
 from factorsfm.support.json_text import json_text
+from factorsfm.support.output_files import kind_of
 from factorsfm.support.program import PROGRAM
 
 # Whatever an earlier result may have left besides summary.json; picture.png is drawn by the demo, view.html by `view`.
@@ -98,6 +99,8 @@ def check_directory(directory: str | Path) -> None:
         InputError: the directory cannot be written, or holds something else than an earlier result.
     """
     directory = Path(directory)
+    if (kind := kind_of(directory)) not in (None, "a folder"):
+        raise InputError(f"cannot write to the output folder {directory}: it is {kind}")
     try:
         if directory.exists() and not (_is_empty(directory) or is_earlier_result(directory)):
             raise InputError(

@@ -25,6 +25,7 @@ from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.priors.image_depth import ImageDepth
 from factorsfm.streaming.relocalization import KeyframeView
 from factorsfm.support.errors import InputError
+from factorsfm.support.output_files import replaced_file
 from factorsfm.support.status import FrameStatus
 from factorsfm.tracks.image_tracks import ImageTracks
 
@@ -41,20 +42,21 @@ def write_snapshot(path: Path, state: Mapping[str, Any]) -> None:
     """Write a state: nested dicts, lists, tuples, numbers, strings, arrays, cameras, and the estimator's own records.
 
     Raises:
-        InputError: the file cannot be written; an older one at its place is untouched.
+        InputError: the file cannot be written, or is something else than a file; an older one is untouched.
     """
     writer = _Writer()
     header = json.dumps(writer.packed(state)).encode()
     body = b"".join([_MAGIC, len(header).to_bytes(8, "little"), header, *writer.chunks])
     temporary = None
     try:
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
+        target = replaced_file(path)
+        with tempfile.NamedTemporaryFile(dir=target.parent, prefix=f".{path.name}.", delete=False) as file:
             temporary = Path(file.name)
             file.write(body)
             file.write(hashlib.sha256(body).digest())
             file.flush()
             os.fsync(file.fileno())
-        temporary.replace(path)
+        temporary.replace(target)
     except OSError as error:
         if temporary is not None:
             temporary.unlink(missing_ok=True)

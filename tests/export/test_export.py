@@ -239,6 +239,20 @@ def test_unwritable_output_is_an_input_error(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
 
+@pytest.mark.parametrize("kind", ["a pipe", "a link that leads nowhere"])
+def test_a_result_takes_the_place_of_nothing_but_a_folder(tmp_path: Path, kind: str) -> None:
+    output = tmp_path / "output"
+    if kind == "a pipe":
+        os.mkfifo(output)
+    else:
+        output.symlink_to("absent")
+    mode = output.lstat().st_mode
+    for call in (lambda: write_folder(build(), output), lambda: check_directory(output)):
+        with pytest.raises(InputError, match=rf"cannot write to the output folder .*output: it is {kind}"):
+            call()
+    assert [(path.name, path.lstat().st_mode) for path in tmp_path.iterdir()] == [("output", mode)]
+
+
 @pytest.mark.parametrize("existing", [False, True])
 def test_an_error_half_way_leaves_what_was_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, existing: bool

@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import re
 import subprocess
 import sys
@@ -676,6 +677,33 @@ def test_output_that_holds_something_else_is_left_alone(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="is a file; this format is a folder"):
         export(hard_reconstruction(), folder / "mine.txt", format="colmap")
     assert [(p.name, p.read_text()) for p in folder.iterdir()] == [("mine.txt", "x")]
+
+
+@pytest.mark.parametrize("format", ["ply", "colmap"])
+def test_output_that_is_neither_file_nor_folder_is_left_alone(tmp_path: Path, format: str) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for name, target in (("to_pipe", "pipe"), ("to_nothing", "absent"), ("to_itself", "to_itself")):
+        (tmp_path / name).symlink_to(target)
+    before = {path.name: path.lstat().st_mode for path in tmp_path.iterdir()}
+    for name, kind in (("pipe", "pipe"), ("to_pipe", "pipe"), ("to_nothing", "link"), ("to_itself", "link")):
+        with pytest.raises(InputError, match=rf"{name}:? (it )?is a {kind}.*(file is expected|format is a folder)$"):
+            export(hard_reconstruction(), tmp_path / name, format=format)
+        assert {path.name: path.lstat().st_mode for path in tmp_path.iterdir()} == before
+
+
+def test_output_at_a_link_is_where_it_leads_to(tmp_path: Path) -> None:
+    export(hard_reconstruction(), tmp_path / "expected", format="tum")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "file").write_text("an earlier one")
+    for name, target in (("to_file", "folder/file"), ("to_folder", "folder")):
+        (tmp_path / name).symlink_to(target)
+    export(hard_reconstruction(), tmp_path / "to_file", format="tum")
+    assert (tmp_path / "to_file").readlink() == Path("folder/file")
+    assert (tmp_path / "folder" / "file").read_bytes() == (tmp_path / "expected").read_bytes()
+    (tmp_path / "folder" / "file").unlink()
+    export(hard_reconstruction(), tmp_path / "to_folder", format="colmap")
+    assert (tmp_path / "to_folder").readlink() == Path("folder")
+    assert pycolmap.Reconstruction(tmp_path / "folder").num_reg_images() == 5
 
 
 def test_footage_must_be_a_numbered_sequence_or_is_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
