@@ -30,6 +30,7 @@ from factorsfm.cli.command import (
 from factorsfm.cli.interrupt import first_interrupt
 from factorsfm.cli.progress_line import ProgressLine
 from factorsfm.cli.stream_results import StreamResults
+from factorsfm.export.writing import entries_of
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.live_sources import Source, open_source
 from factorsfm.frames.raw import RawFormat
@@ -226,7 +227,7 @@ def _check(arguments: argparse.Namespace) -> None:
     if arguments.snapshot and not arguments.snapshot.absolute().parent.is_dir():
         raise InputError(f"snapshot {arguments.snapshot} cannot be written: its folder does not exist")
     check_directory(arguments.output)
-    if arguments.cuts and arguments.output.is_dir() and any(arguments.output.iterdir()):
+    if arguments.cuts and arguments.output.is_dir() and entries_of(arguments.output):
         raise InputError(f"the output folder {arguments.output} is not empty; --cuts needs a new or empty one")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -11,6 +12,9 @@ from pathlib import Path
 from factorsfm.support.errors import InputError
 from factorsfm.support.output_files import kind_of, replaced_file
 from factorsfm.support.program import PROGRAM
+
+_TEMPORARY = f".{PROGRAM}-"  # begins the names of temporary folders
+REPLACING = f"{_TEMPORARY}replacing-"  # of those in a folder whose entries are replaced
 
 
 @contextmanager
@@ -56,6 +60,31 @@ def complete_folder(path: Path) -> Iterator[Path]:
             folder.rename(path)
 
 
+@contextmanager
+def temporary_folder(path: Path) -> Iterator[Path]:
+    """Yields a temporary folder from which a file or folder can be renamed to `path`, or entries into that folder.
+
+    It is beside the path, or inside of a folder that exists, since that may be a mount point or the working directory.
+    What earlier ones have left inside, of a program that was killed, goes when the block ends without an error.
+
+    Raises:
+        OSError: it cannot be made.
+    """
+    inside = path.is_dir()
+    place = path if inside else path.absolute().parent
+    place.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=REPLACING if inside else _TEMPORARY, dir=place) as folder:
+        yield Path(folder)
+    if inside:
+        for left in path.glob(f"{REPLACING}*"):
+            shutil.rmtree(left, ignore_errors=True)
+
+
+def entries_of(folder: Path) -> list[Path]:
+    """What is in a folder, without what a program has left there that was killed."""
+    return [path for path in folder.iterdir() if not path.name.startswith(_TEMPORARY)]
+
+
 def rename_all(moves: Iterable[tuple[Path, Path]]) -> None:
     """Rename paths one by one, each from the first to the second; after an error, all renames are undone."""
     done: list[tuple[Path, Path]] = []
@@ -78,7 +107,7 @@ def exchanged(directory: Path, new: Path, replaced: Path, names: Iterable[str]) 
 
 def _replace_content(path: Path, new: Path, replaced: Path) -> None:
     entries = {entry.relative_to(new) for entry in new.rglob("*")}
-    present = [entry for entry in path.rglob("*") if entry not in new.parents and not entry.is_relative_to(new)]
+    present = {inner for entry in entries_of(path) for inner in (entry, *entry.rglob("*"))}
     if others := {entry.relative_to(path) for entry in present} - entries:
         raise InputError(f"the output folder {path} holds something else ({min(others)}); choose a new folder")
     replaced.mkdir()
@@ -87,12 +116,9 @@ def _replace_content(path: Path, new: Path, replaced: Path) -> None:
 
 @contextmanager
 def _temporary_beside(path: Path) -> Iterator[Path]:
-    # Inside a folder that exists, since that may be a mount point or the working directory.
-    place = path if path.is_dir() else path.absolute().parent
     try:
-        place.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{PROGRAM}-", dir=place) as folder:
-            yield Path(folder)
+        with temporary_folder(path) as folder:
+            yield folder
     except OSError as error:
         raise _unwritable(path, error) from error
 

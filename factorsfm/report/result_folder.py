@@ -13,7 +13,7 @@ from typing import Any
 from factorsfm.export.colmap import write_colmap
 from factorsfm.export.ply import write_ply
 from factorsfm.export.trajectory import write_trajectory
-from factorsfm.export.writing import exchanged, rename_all
+from factorsfm.export.writing import REPLACING, entries_of, exchanged, rename_all, temporary_folder
 from factorsfm.report.page import failure_html, report_html
 from factorsfm.result.moving import moving_json
 from factorsfm.result.objects import objects_json
@@ -33,7 +33,6 @@ _ENTRIES = (
 )  # fmt: skip
 _SUMMARY = "summary.json"
 _PARTS = "part-[0-9][0-9][0-9]*"  # folders of the other parts of an image set
-_REPLACING = f".{PROGRAM}-replacing-"  # begins the name of the folder in which a result waits that replaces another
 
 
 def write_folder(reconstruction: Reconstruction, directory: str | Path) -> None:
@@ -102,7 +101,7 @@ def check_directory(directory: str | Path) -> None:
     if (kind := kind_of(directory)) not in (None, "a folder"):
         raise InputError(f"cannot write to the output folder {directory}: it is {kind}")
     try:
-        if directory.exists() and not (_is_empty(directory) or is_earlier_result(directory)):
+        if directory.exists() and entries_of(directory) and not is_earlier_result(directory):
             raise InputError(
                 f"the output folder {directory} is not empty and holds no earlier factorsfm result; "
                 "choose a new or empty folder"
@@ -124,21 +123,15 @@ def _complete_or_nothing(directory: Path) -> Iterator[Path]:
     """A folder to write into; its content becomes `directory` when the block ends without an error."""
     check_directory(directory)
     existed = directory.exists()
-    # Inside a directory that exists, since that may be a mount point or the working directory.
-    place, prefix = (directory, _REPLACING) if existed else (directory.absolute().parent, f".{PROGRAM}-")
     try:
-        place.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=prefix, dir=place) as temporary:
-            folder = Path(temporary) / "result"  # a plain mkdir honours the umask, mkdtemp does not
+        with temporary_folder(directory) as temporary:
+            folder = temporary / "result"  # a plain mkdir honours the umask, the temporary folder does not
             folder.mkdir()
             yield folder
             if existed:
-                _replace_entries(directory, folder, Path(temporary) / "replaced")
+                _replace_entries(directory, folder, temporary / "replaced")
             else:
                 folder.rename(directory)
-        if existed:
-            for left in directory.glob(f"{_REPLACING}*"):  # by a program that was killed
-                shutil.rmtree(left, ignore_errors=True)
     except OSError as error:
         raise _unwritable(directory, error) from error
 
@@ -171,7 +164,7 @@ def remove_result(directory: Path) -> None:
         InputError: it cannot be removed.
     """
     try:
-        with tempfile.TemporaryDirectory(prefix=_REPLACING, dir=directory) as temporary:
+        with tempfile.TemporaryDirectory(prefix=REPLACING, dir=directory) as temporary:
             _mark_incomplete(directory, Path(temporary))
             for name in _entries(directory):
                 (directory / name).replace(Path(temporary) / name)
@@ -197,11 +190,6 @@ def _entries(directory: Path) -> list[str]:
 def _parts(directory: Path) -> list[str]:
     """Names of the folders that other parts of an image set have in that of an earlier result."""
     return [path.name for path in directory.glob(_PARTS) if is_earlier_result(path)]
-
-
-def _is_empty(directory: Path) -> bool:
-    """But for what a program has left that was killed."""
-    return all(path.name.startswith(_REPLACING) for path in directory.iterdir())
 
 
 def is_earlier_result(directory: Path) -> bool:
