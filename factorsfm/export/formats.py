@@ -166,7 +166,7 @@ def export(
     options = options or ExportOptions()
     _check_training(format, options)
     shot = make_shot(reconstruction, options, chosen.defaults)
-    with (complete_folder if chosen.is_folder else complete_file)(Path(path)) as place:
+    with complete_folder(Path(path), format) if chosen.is_folder else complete_file(Path(path)) as place:
         chosen.write(shot, place)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -13,7 +12,7 @@ from typing import Any
 from factorsfm.export.colmap import write_colmap
 from factorsfm.export.ply import write_ply
 from factorsfm.export.trajectory import write_trajectory
-from factorsfm.export.writing import REPLACING, entries_of, exchanged, rename_all, temporary_folder
+from factorsfm.export.writing import REPLACING, entries_of, replace_entries, temporary_folder
 from factorsfm.report.page import failure_html, report_html
 from factorsfm.result.moving import moving_json
 from factorsfm.result.objects import objects_json
@@ -129,32 +128,12 @@ def _complete_or_nothing(directory: Path) -> Iterator[Path]:
             folder.mkdir()
             yield folder
             if existed:
-                _replace_entries(directory, folder, temporary / "replaced")
+                names = {*_entries(directory), *(path.name for path in folder.iterdir())}
+                replace_entries(directory, folder, temporary / "replaced", names, _SUMMARY, _incomplete(temporary))
             else:
                 folder.rename(directory)
     except OSError as error:
         raise _unwritable(directory, error) from error
-
-
-def _replace_entries(directory: Path, new: Path, replaced: Path) -> None:
-    """Exchange the entries of a result one by one, summary.json last; an error takes everything back."""
-    summary, before = directory / _SUMMARY, replaced / _SUMMARY
-    names = {*_entries(directory), *(path.name for path in new.iterdir())} - {_SUMMARY}
-    replaced.mkdir()
-    if summary.exists():
-        shutil.copyfile(summary, before)
-    moves = [*exchanged(directory, new, replaced, sorted(names)), (new / _SUMMARY, summary)]
-    try:
-        _mark_incomplete(directory, new.parent)
-        rename_all(moves)
-    except BaseException:
-        if not all(os.path.lexists(source) for source, _ in moves):
-            raise  # not everything could be undone: the result stays incomplete
-        if before.exists():
-            before.replace(summary)
-        else:
-            summary.unlink(missing_ok=True)
-        raise
 
 
 def remove_result(directory: Path) -> None:
@@ -165,7 +144,7 @@ def remove_result(directory: Path) -> None:
     """
     try:
         with tempfile.TemporaryDirectory(prefix=REPLACING, dir=directory) as temporary:
-            _mark_incomplete(directory, Path(temporary))
+            _incomplete(Path(temporary)).replace(directory / _SUMMARY)
             for name in _entries(directory):
                 (directory / name).replace(Path(temporary) / name)
             (directory / _SUMMARY).unlink()
@@ -175,11 +154,11 @@ def remove_result(directory: Path) -> None:
         raise _unwritable(directory, error) from error
 
 
-def _mark_incomplete(directory: Path, temporary: Path) -> None:
-    """Let summary.json say that the result is incomplete, for as long as it is, also where the program is killed."""
+def _incomplete(temporary: Path) -> Path:
+    """A summary that says that the result is incomplete, for as long as it is, also where the program is killed."""
     marker = temporary / "incomplete.json"
     marker.write_text(json_text(incomplete_summary()), encoding="utf-8")
-    marker.replace(directory / _SUMMARY)
+    return marker
 
 
 def _entries(directory: Path) -> list[str]:

@@ -28,7 +28,7 @@ from tests.export_problems import (
     seen_points,
     true_world_from_film,
 )
-from tests.exported_files import after_effects_tracks, nuke_curves, nuke_nodes
+from tests.exported_files import after_effects_tracks, exported, nuke_curves, nuke_nodes
 
 Array = NDArray[np.float64]
 
@@ -59,7 +59,7 @@ def in_film_camera(world_from_film: Array, points: Array) -> Array:
 def test_colmap_in_pycolmap(tmp_path: Path, format: str, up_axis: str) -> None:
     reconstruction = hard_reconstruction()
     export(reconstruction, tmp_path / "out", format=format, options=ExportOptions(up_axis=up_axis, scale=HAND))
-    suffixes = {path.suffix for path in (tmp_path / "out").iterdir()}
+    suffixes = {Path(name).suffix for name in exported(tmp_path / "out")}
     assert suffixes == {".txt" if format == "colmap" else ".bin"}
     model = pycolmap.Reconstruction(tmp_path / "out")
     (camera,) = model.cameras.values()
@@ -210,12 +210,7 @@ def test_nuke_script_projects_as_pycolmap(tmp_path: Path) -> None:
     reconstruction = hard_reconstruction()
     options = ExportOptions(scale=HAND, sensor_width=24.89, fps=25, first_frame=101)
     export(reconstruction, tmp_path / "out", format="nuke", options=options)
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {
-        "camera.nk",
-        "points.obj",
-        "undistort.exr",
-        "distort.exr",
-    }
+    assert exported(tmp_path / "out") == {"camera.nk", "points.obj", "undistort.exr", "distort.exr"}
     nodes = nuke_nodes((tmp_path / "out" / "camera.nk").read_text())
     root, camera = nodes["Root"], nodes["Camera"]
     assert (root["first_frame"], root["last_frame"], root["fps"]) == ("111", "121", "25")
@@ -262,7 +257,7 @@ def test_nuke_script_wiring(tmp_path: Path) -> None:
         "PointsOnPlate": ["Plate", "Distort"],
     }
     assert straight == {"PointsOnUndistortedPlate": ["Plate", "Points", "Camera"]}
-    assert {path.name for path in (tmp_path / "straight").iterdir()} == {"camera.nk", "points.obj"}
+    assert exported(tmp_path / "straight") == {"camera.nk", "points.obj"}
     plate = nuke_nodes((tmp_path / "bent" / "camera.nk").read_text())["Plate"]
     assert plate["file"] == f'"{footage.as_posix()}/shot.%04d.png"'
     assert (plate["first"], plate["last"]) == ("1001", "1030")
@@ -535,7 +530,7 @@ def test_undistorted_plates(tmp_path: Path, movie: bool) -> None:
         originals = [capture.read()[1] for _ in originals]
     options = ExportOptions(footage=footage, first_frame=1)
     export(reconstruction, tmp_path / "out", format="undistorted", options=options)
-    plates = sorted((tmp_path / "out").iterdir())
+    plates = [tmp_path / "out" / name for name in sorted(exported(tmp_path / "out"))]
     assert [path.name for path in plates] == ["plate.0001.png", "plate.0002.png", "plate.0003.png"]
     matrix = np.array([[600, 0, 289.5], [0, 1200, 261.5], [0, 0, 1]], float)  # pixel centres at integers
     maps = cv2.initUndistortRectifyMap(
@@ -656,14 +651,14 @@ def test_an_error_while_an_export_is_replaced_leaves_the_earlier_one(
 
         return renamed
 
-    for most in range(6):  # transforms.json, points.ply and images/, each out and in
+    for most in range(8):  # transforms.json, points.ply and images/, each out and in, and the list before and after
         monkeypatch.setattr(Path, "replace", failing_after(most))
         with pytest.raises(InputError, match="Input/output error"):
             export(hard_reconstruction(), out, format="nerfstudio", options=options)
         assert {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()} == before
-    monkeypatch.setattr(Path, "replace", failing_after(6))
+    monkeypatch.setattr(Path, "replace", failing_after(8))
     export(hard_reconstruction(), out, format="nerfstudio", options=options)
-    assert len(renames) == 6
+    assert len(renames) == 8
 
 
 def test_output_that_holds_something_else_is_left_alone(tmp_path: Path) -> None:
@@ -733,7 +728,7 @@ def test_output_can_be_the_working_directory(tmp_path: Path, monkeypatch: pytest
     monkeypatch.chdir(tmp_path)
     for _ in range(2):
         export(hard_reconstruction(), ".", format="colmap")
-    assert {path.name for path in tmp_path.iterdir()} == {"cameras.txt", "images.txt", "points3D.txt"}
+    assert exported(tmp_path) == {"cameras.txt", "images.txt", "points3D.txt"}
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from factorsfm.report.overlay import write_overlay
 from factorsfm.result.reconstruction import Reconstruction
 from factorsfm.support.errors import InputError
 from tests.export_problems import hard_reconstruction, noise_images
-from tests.exported_files import after_effects_tracks, nuke_nodes
+from tests.exported_files import after_effects_tracks, exported, nuke_nodes
 from tests.video_files import interlaced, moving_texture
 
 
@@ -170,11 +170,11 @@ def test_undistorted_plates_keep_the_bits_of_the_originals(tmp_path: Path, kind:
         cv2.imwrite(str(folder / "plate.1001.png"), original)
     solved = numbered()
     export(solved, tmp_path / "out", format="undistorted", options=ExportOptions(footage=folder))
-    (plate,) = (tmp_path / "out").iterdir()
-    assert plate.name == ("plate.1001.exr" if kind == "half" else "plate.1001.png")
+    (name,) = exported(tmp_path / "out")
+    assert name == ("plate.1001.exr" if kind == "half" else "plate.1001.png")
     matrix = np.array([[600, 0, 289.5], [0, 1200, 261.5], [0, 0, 1]], float)
     maps = cv2.initUndistortRectifyMap(matrix, solved.camera.params[4:], np.eye(3), matrix, (640, 480), cv2.CV_32FC1)
     expected = cv2.remap(original, *maps, cv2.INTER_CUBIC).astype(np.float64)
-    found = read_pixels(plate)
+    found = read_pixels(tmp_path / "out" / name)
     assert found.dtype == (np.float16 if kind == "half" else np.uint16)
     np.testing.assert_allclose(found[50:-50, 50:-50], expected[50:-50, 50:-50], rtol=4e-3, atol=0.01)
