@@ -29,6 +29,7 @@ from tests.export_problems import (
     true_world_from_film,
 )
 from tests.exported_files import after_effects_tracks, exported, nuke_curves, nuke_nodes
+from tests.video_files import moving_texture, write_video
 
 Array = NDArray[np.float64]
 
@@ -713,8 +714,7 @@ def test_footage_must_be_a_numbered_sequence_or_is_left_out(tmp_path: Path, capl
 
 
 def test_source_is_the_footage_where_none_is_given(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    footage = tmp_path / "a [1] $x.mp4"
-    footage.write_bytes(b"not looked at")
+    footage = write_video(tmp_path / "a [1] $x.mp4", moving_texture(21))
     export(hard_reconstruction(options={"source": str(footage)}), tmp_path / "out", format="nuke")
     plate = nuke_nodes((tmp_path / "out" / "camera.nk").read_text())["Plate"]
     assert plate["file"] == '"' + str(footage).replace("[", r"\[").replace("$", r"\$") + '"'
@@ -722,6 +722,23 @@ def test_source_is_the_footage_where_none_is_given(tmp_path: Path, caplog: pytes
     assert caplog.text == ""  # the script undistorts it
     export(hard_reconstruction(options={"source": str(footage)}), tmp_path / "out.py", format="blender")
     assert "the lens distorts" in caplog.text
+
+
+def test_a_source_that_cannot_be_decoded_is_no_plate(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    footage = tmp_path / "shot.mp4"
+    footage.write_bytes(b"no video")
+    for options, format in ((None, "nuke"), (None, "blender"), (ExportOptions(footage=footage), "nuke")):
+        result = hard_reconstruction("PINHOLE", options={"source": str(footage)})
+        if options is not None:
+            with pytest.raises(InputError, match=r"shot\.mp4 cannot be decoded as a video"):
+                export(result, tmp_path / "refused", format=format, options=options)
+        else:
+            export(result, tmp_path / format, format=format)
+            (message,) = caplog.messages
+            assert message.startswith(f"there is no plate: {footage} cannot be decoded as a video")
+            caplog.clear()
+    assert nuke_nodes((tmp_path / "nuke" / "camera.nk").read_text())["Plate"]["class"] == "Constant"
+    assert {path.name for path in tmp_path.iterdir()} == {"shot.mp4", "nuke", "blender"}
 
 
 def test_output_can_be_the_working_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
