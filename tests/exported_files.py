@@ -1,6 +1,15 @@
-"""Plain readers of what exports write for Nuke and After Effects."""
+"""Plain readers of what exports write: folders, and files for Nuke and After Effects."""
 
+import json
 import re
+from pathlib import Path
+
+
+def exported(folder: Path) -> set[str]:
+    """Names of what is in the folder of an export, all of which its list knows."""
+    entries = {path.relative_to(folder).as_posix() for path in folder.rglob("*")} - {".factorsfm"}
+    assert entries == {*json.loads((folder / ".factorsfm").read_text())["entries"]}
+    return {name for name in entries if "/" not in name}
 
 
 def nuke_nodes(text: str) -> dict[str, dict[str, str]]:

@@ -11,6 +11,7 @@ from factorsfm.cli.progress_line import ProgressLine
 from factorsfm.export.formats import FORMATS, export
 from factorsfm.export.how_to_train import how_to_train
 from factorsfm.export.options import ExportOptions
+from factorsfm.export.trajectory import counts_frames
 from factorsfm.frames.timing import are_uneven
 from factorsfm.result.reading import read_result
 from factorsfm.support.up_axis import UpAxis
@@ -59,7 +60,8 @@ def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
     lost = len(reconstruction.frames) - len(reconstruction.registered)
     without = f"; {lost} of {len(reconstruction.frames)} frames are not registered and have no camera" if lost else ""
     times = [frame.timestamp for frame in reconstruction.frames]
-    uneven = arguments.format != "tum" and are_uneven([frame.index for frame in reconstruction.frames], times)
+    counted = arguments.format != "tum" or counts_frames(options)
+    uneven = counted and are_uneven([frame.index for frame in reconstruction.frames], times)
     rate = "; its frames come at uneven times, and here each lasts as long as any other" if uneven else ""
     wrote = f"Wrote {arguments.format} ({FORMATS[arguments.format].description}) to {arguments.output}{without}{rate}."
     if not FORMATS[arguments.format].trains:

@@ -30,6 +30,7 @@ from factorsfm.cli.command import (
 from factorsfm.cli.interrupt import first_interrupt
 from factorsfm.cli.progress_line import ProgressLine
 from factorsfm.cli.stream_results import StreamResults
+from factorsfm.export.writing import entries_of
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.live_sources import Source, open_source
 from factorsfm.frames.raw import RawFormat
@@ -228,7 +229,7 @@ def _check(arguments: argparse.Namespace) -> None:
         raise InputError(f"snapshot {arguments.snapshot} cannot be written: its folder does not exist")
     check_directory(arguments.output, arguments.source)
     spare_footage([path for path in (arguments.snapshot, arguments.record) if path], arguments.source)
-    if arguments.cuts and arguments.output.is_dir() and any(arguments.output.iterdir()):
+    if arguments.cuts and arguments.output.is_dir() and entries_of(arguments.output):
         raise InputError(f"the output folder {arguments.output} is not empty; --cuts needs a new or empty one")
 
 

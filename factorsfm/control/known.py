@@ -221,7 +221,8 @@ class Control:
         if not poses:
             raise InputError(
                 f"control: none of the {len(self.poses)} poses, of frames {self.poses[0].frame} to "
-                f"{self.poses[-1].frame}, is of a frame of the source; a control file can name the first_frame"
+                f"{self.poses[-1].frame}, is of a frame of the source; a control file can name the first_frame, "
+                "and the fps of an Alembic archive"
             )
         return replace(self, poses=poses)
 

@@ -56,8 +56,8 @@ def read_tracked(path: Path, fps: float | None = None) -> TrackedCamera:
     """The camera in a file: Nuke's .chan, USD, Alembic, nerfstudio's transforms.json, or a folder with COLMAP's model.
 
     Args:
-        fps: of an Alembic archive, which has times instead of frames; None takes the shortest time between samples for
-            a frame.
+        fps: of an Alembic archive, which has times instead of frames; None takes the rate that it states, as exports
+            do, else the shortest time between samples for a frame.
 
     Raises:
         InputError: it cannot be read, or holds no camera, or more than one, or one that stands still.
@@ -191,11 +191,11 @@ def _usd(path: Path) -> Poses:
 def _alembic(path: Path, fps: float | None) -> Poses:
     abc, geom = require("alembic3d.Abc"), require("alembic3d.AbcGeom")
     try:
-        top = abc.IArchive(str(path)).getTop()
+        archive = abc.IArchive(str(path))
     except RuntimeError as error:
         raise InputError("it is no Alembic archive") from error
     cameras: list[list[Any]] = []
-    _collect(top, [], cameras, geom)
+    _collect(archive.getTop(), [], cameras, geom)
     chain = _one(cameras, [header.getName() for *_, header in cameras])[:-1]
     transforms = [geom.IXform(parent, header.getName()).getSchema() for parent, header in chain]
     longest = max(transforms, key=lambda schema: schema.getNumSamples(), default=None)
@@ -203,14 +203,14 @@ def _alembic(path: Path, fps: float | None) -> Poses:
         return {}
     sampling = longest.getTimeSampling()
     times = [sampling.getSampleTime(k) for k in range(longest.getNumSamples())]
-    rate = fps or _frame_rate(times)
+    rate = fps or abc.GetArchiveInfo(archive).get("dccFPS") or _frame_rate(times)
     found: Poses = {}
-    for time in times:
+    for number in sorted({round(time * rate) for time in times}):
         matrix = np.eye(4)
         for schema in transforms:
-            sample = schema.getValue(abc.ISampleSelector(time))
+            sample = schema.getValue(abc.ISampleSelector(number / rate))  # the nearest one
             matrix = matrix @ np.array([[sample.getMatrix()[row][k] for row in range(4)] for k in range(4)])
-        found[round(time * rate)] = _opencv(_without_scale(matrix), UpAxis.Y)
+        found[number] = _opencv(_without_scale(matrix), UpAxis.Y)
     return found
 
 

@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 
 from factorsfm.export.shot import Shot, linear_colors
 from factorsfm.support.extras import failures_as_os_errors, require
+from factorsfm.support.program import PROGRAM, program_version
 
 CAMERA, POINTS = "camera", "points"
 
 
 def write_alembic(shot: Shot, path: Path) -> None:
-    """Write an archive (Ogawa); the time of a frame is its number divided by the frame rate.
+    """Write an archive (Ogawa); the time of a frame is its number divided by the frame rate, which the archive states.
 
     The focal length is in mm and the film back in cm, as Alembic requires. Only registered frames have a sample; tools
     interpolate between them. An object is a transform with its points below it. Distortion is not included.
@@ -29,7 +30,7 @@ def write_alembic(shot: Shot, path: Path) -> None:
     points = len(shot.reconstruction.points) + sum(len(thing.points) for thing in shot.nulls)
     _check_room(path, 64 * 1024 + 1024 * samples + 64 * points)
     with failures_as_os_errors():
-        archive = abc.OArchive(str(path), asOgawa=True)
+        archive = abc.CreateArchiveWithInfo(str(path), shot.fps, f"{PROGRAM} {program_version()}", "")
         sampling = archive.addTimeSampling(_sampling(shot.numbers, shot.fps, core))
         _write_camera(shot, archive, sampling, geom, imath)
         _write_points(archive.getTop(), shot.reconstruction.points, shot.reconstruction.colors, geom, imath)

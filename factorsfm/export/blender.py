@@ -13,8 +13,12 @@ from numpy.typing import NDArray
 
 from factorsfm.export.footage import Sequence, background
 from factorsfm.export.shot import Shot
+from factorsfm.support.errors import InputError
 
 logger = logging.getLogger(__name__)
+
+# What Blender takes; it moves every other value into these ranges without a word.
+_MOST_FPS, _LAST_FRAME, _LEAST_MM = 32767, 1048574, 1.0
 
 _BUILD = """
 import bpy
@@ -113,16 +117,33 @@ def write_blender(shot: Shot, path: Path) -> None:
     camera has no distortion, so the footage behind it should be undistorted.
 
     Raises:
-        InputError: the footage is a folder whose images are not a numbered sequence.
+        InputError: the footage is a folder whose images are not a numbered sequence, or Blender has no such frames, or
+            no lens so short.
     """
+    _check_ranges(shot)
     text = json.dumps(_data(shot), allow_nan=False)
     title = '"""Builds the animated camera, the points and the footage of a factorsfm reconstruction in Blender."""'
     path.write_text(f"{title}\n\nimport json\n\nDATA = json.loads({text!r})\n{_BUILD}", encoding="utf-8")
 
 
+def _check_ranges(shot: Shot) -> None:
+    """Refuse what Blender would change."""
+    if shot.first < 0 or shot.last > _LAST_FRAME:
+        raise InputError(
+            f"the frames have the numbers {shot.first} to {shot.last}, and Blender has 0 to {_LAST_FRAME}; "
+            "another first frame is expected"
+        )
+    shortest = min(lens.focal_length for lens in shot.lenses)
+    if min(shortest, shot.sensor_width) < _LEAST_MM:
+        raise InputError(
+            f"the lens has {shortest:.3g} mm on a sensor of {shot.sensor_width:.3g} mm, and Blender has "
+            f"{_LEAST_MM:g} mm and more; a larger sensor width is expected"
+        )
+
+
 def _data(shot: Shot) -> dict[str, Any]:
     lens = shot.lens
-    fps = round(shot.fps)
+    fps = min(max(round(shot.fps), 1), _MOST_FPS)  # a whole number, which another one divides
     # In Blender one of the two is 1 and the other one at least 1.
     pixel_aspect = max(lens.pixel_aspect, 1.0), max(1 / lens.pixel_aspect, 1.0)
     return {

@@ -61,7 +61,7 @@ def write_colmap(reconstruction: Reconstruction, folder: str | Path) -> None:
         model = pycolmap.Reconstruction(folder)
         for image_id, image in model.images.items():
             image.name = names[image_id]
-        model.write_binary(folder)
+        _write_binary(model, folder)
 
 
 def write_colmap_binary(reconstruction: Reconstruction, folder: str | Path) -> None:
@@ -70,7 +70,27 @@ def write_colmap_binary(reconstruction: Reconstruction, folder: str | Path) -> N
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as text:
         write_colmap(reconstruction, text)
-        pycolmap.Reconstruction(text).write_binary(folder)
+        _write_binary(pycolmap.Reconstruction(text), folder)
+
+
+def _write_binary(model: pycolmap.Reconstruction, folder: Path) -> None:
+    """Write a model, and check that all of it has been written: pycolmap says nothing of a full disk.
+
+    COLMAP may never come to an end with a file that is cut off, so that the files are not read back.
+
+    Raises:
+        OSError: a file is cut off.
+    """
+    model.write_binary(folder)
+    # COLMAP's format: a count, then numbers of 4 or 8 bytes and names that end in 0.
+    expected = {
+        "cameras.bin": 8 + sum(24 + 8 * len(camera.params) for camera in model.cameras.values()),
+        "images.bin": 8 + sum(73 + len(i.name.encode()) + 24 * len(i.points2D) for i in model.images.values()),
+        "points3D.bin": 8 + sum(51 + 8 * point.track.length() for point in model.points3D.values()),
+    }
+    for name, size in expected.items():
+        if (written := (folder / name).stat().st_size) < size:
+            raise OSError(f"only {written} of {size} bytes of {name} are written; is the disk full?")
 
 
 def write_colmap_training(shot: Shot, folder: Path, write: Callable[[Reconstruction, Path], None]) -> None:

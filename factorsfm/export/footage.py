@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator
+from collections.abc import Container, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from factorsfm.export.shot import Shot
+from factorsfm.frames.fields import Fields
 from factorsfm.frames.folders import list_images
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.numbering import missing_numbers
@@ -15,10 +18,14 @@ from factorsfm.frames.photographs import in_format_of
 from factorsfm.frames.reading import read_frames
 from factorsfm.frames.sequences import numbered_names, sequence_numbers
 from factorsfm.frames.unordered import read_images
+from factorsfm.frames.video import announced_frames, are_fields
 from factorsfm.result.reconstruction import FrameResult
 from factorsfm.support.errors import InputError
+from factorsfm.support.first_few import first_few
 
 logger = logging.getLogger(__name__)
+
+_NAMED = 5  # stretches of frames in a warning
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,10 +55,11 @@ class Sequence:
 
 
 def background(shot: Shot) -> Path | Sequence | None:
-    """The movie file or the sequence of images behind the scene.
+    """The movie file or the sequence of images behind the scene; a warning names frames that it lacks.
 
     Raises:
-        InputError: the user gave a folder whose images are not a numbered sequence.
+        InputError: the user gave a movie that cannot be decoded or whose fields were solved, or a folder whose images
+            are not a numbered sequence.
     """
     path = shot.footage
     if path is None:
@@ -59,15 +67,45 @@ def background(shot: Shot) -> Path | Sequence | None:
         if isinstance(said, str) and Path(said).is_absolute():
             logger.warning("the footage %s is not where it was, and no plate is written; --footage says where", said)
         return None
-    if path.is_file():
-        return path.absolute()
     try:
-        return image_sequence(path)
+        found, held = _movie(path, shot.fields) if path.is_file() else _numbered(path)
     except InputError as error:
         if shot.options.footage is not None:
             raise
-        logger.warning("%s; they are left out", error)
+        logger.warning("there is no plate: %s", error)
         return None
+    warn_of_missing(shot, held)
+    return found
+
+
+def _movie(path: Path, fields: Fields) -> tuple[Path, range]:
+    """A movie file, and the numbers of its frames."""
+    if are_fields(path, fields):
+        raise InputError(
+            f"{path} is interlaced, and the result is of its fields, twice the frames of half the lines; the format "
+            "undistorted writes plates of the fields"
+        )
+    return path.absolute(), range(announced_frames(path))
+
+
+def _numbered(folder: Path) -> tuple[Sequence, range]:
+    """The images in a folder, and the numbers from the first to the last."""
+    sequence = image_sequence(folder)
+    return sequence, range(sequence.first, sequence.last + 1)
+
+
+def warn_of_missing(shot: Shot, held: Container[int]) -> None:
+    """Log which frames of the result the footage lacks, in words; `held`: the numbers of its frames."""
+    frames = shot.in_footage
+    lacking = np.flatnonzero([frame.index + shot.numbering.shift not in held for frame in frames])
+    if len(lacking):
+        runs = np.split(lacking, np.flatnonzero(np.diff(lacking) > 1) + 1)
+        ends = [[shot.first_frame + frames[k].index for k in (run[0], run[-1])] for run in runs]
+        spans = [str(first) if first == last else f"{first} to {last}" for first, last in ends]
+        logger.warning(
+            "the footage %s has %d of the %d frames of the result; it lacks %s",
+            shot.footage, len(frames) - len(lacking), len(frames), first_few(spans, _NAMED),
+        )  # fmt: skip
 
 
 def image_sequence(folder: Path) -> Sequence:

@@ -169,7 +169,7 @@ def export(
     _check_training(format, options)
     spare_footage([path], options.footage, *footage_of(reconstruction.options))
     shot = make_shot(reconstruction, options, chosen.defaults)
-    with (complete_folder if chosen.is_folder else complete_file)(Path(path)) as place:
+    with complete_folder(Path(path), format) if chosen.is_folder else complete_file(Path(path)) as place:
         chosen.write(shot, place)
 
 

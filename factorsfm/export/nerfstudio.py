@@ -28,6 +28,8 @@ _MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
     "OPENCV_FISHEYE": ("OPENCV_FISHEYE", ("k1", "k2", "k3", "k4")),
 }
 
+_CURE = "--undistorted writes images without distortion"  # of any lenses
+
 
 def write_nerfstudio(shot: Shot, folder: Path) -> None:
     """Write ``transforms.json``, ``points.ply`` and, if the footage is available, images and masks.
@@ -43,7 +45,7 @@ def write_nerfstudio(shot: Shot, folder: Path) -> None:
     lenses = [_lens(r.camera_of(frame)) for frame in r.registered]
     models = {lens.pop("camera_model") for lens in lenses}
     if len(models) > 1:
-        raise InputError(f"nerfstudio takes lenses of one model, not {' and '.join(sorted(models))} together")
+        raise InputError(f"nerfstudio takes lenses of one model, not {' and '.join(sorted(models))} together; {_CURE}")
     masks = write_training_images(shot, r, folder)
     shared = {} if r.has_own_lenses else lenses[0]  # shared values hide those of a frame
     content = {
@@ -68,7 +70,9 @@ def write_nerfstudio(shot: Shot, folder: Path) -> None:
 
 def _lens(camera: pycolmap.Camera) -> dict[str, Any]:
     if camera.model_name not in _MODELS:
-        raise InputError(f"nerfstudio does not know the lens model {camera.model_name}; it knows {', '.join(_MODELS)}")
+        raise InputError(
+            f"nerfstudio does not know the lens model {camera.model_name}; it knows {', '.join(_MODELS)}; {_CURE}"
+        )
     model, names = _MODELS[camera.model_name]
     values = [float(camera.params[i]) for i in camera.extra_params_idxs()]
     return {

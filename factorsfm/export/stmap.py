@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from factorsfm.camera.projection import PIXEL_CENTER, pixels_from_normalized, without_distortion
 from factorsfm.camera.undistortion import Straightening, distorted_places, pixel_grid
+from factorsfm.export.footage import warn_of_missing
 from factorsfm.export.shot import Shot
 from factorsfm.frames.folders import read_pixels
 from factorsfm.frames.reading import read_frames
@@ -43,7 +44,8 @@ def write_undistorted(shot: Shot, folder: Path) -> None:
 
     Nothing of the plates is lost: images of 8 or 16 bits become PNG of 8 or 16 bits, linear light (EXR) becomes EXR of
     half or float. Unregistered frames and frames outside of the reconstructed range are included, so that the plates
-    can replace the footage. With a zoom, such a frame uses the lens of the frame before it.
+    can replace the footage. With a zoom, such a frame uses the lens of the frame before it. A warning names frames of
+    the reconstruction that the footage lacks.
 
     Raises:
         InputError: there is no footage, or its size is not that of the camera.
@@ -53,12 +55,14 @@ def write_undistorted(shot: Shot, folder: Path) -> None:
         raise InputError("there is no footage to undistort; name a video file or a folder of images")
     own = {frame.index: frame.camera for frame in shot.reconstruction.frames if frame.camera is not None}
     straightening = _straightening(camera)
+    held = set()
     for frame in read_frames(shot.footage, fields=shot.fields):
         height, width = frame.image.shape[:2]
         if (width, height) != (camera.width, camera.height):
             raise InputError(
                 f"the footage {shot.footage} has {width}x{height} pixels, the camera {camera.width}x{camera.height}"
             )
+        held.add(frame.index)
         index = frame.index - shot.numbering.shift
         if index in own:
             straightening = _straightening(own[index])
@@ -69,6 +73,7 @@ def write_undistorted(shot: Shot, folder: Path) -> None:
             write_exr(folder / f"{name}.exr", plate[..., ::-1])
         else:
             write_image(folder / f"{name}.png", plate)
+    warn_of_missing(shot, held)
 
 
 def _cameras(shot: Shot) -> list[tuple[str, pycolmap.Camera]]:

@@ -33,8 +33,11 @@ _PATTERN, _SEARCH = "-12 -12 12 12", "-24 -24 24 24"  # areas of a track around 
 _BLENDER = """
 import bpy
 
-# Without footage the tracks are for the clip that is open.
-clip = bpy.data.movieclips.load(DATA["footage"]) if DATA["footage"] else bpy.data.movieclips[0]
+if DATA["footage"]:
+    clip = bpy.data.movieclips.load(DATA["footage"])
+    clip.frame_start = DATA["frame_start"]
+else:
+    clip = bpy.data.movieclips[0]  # the tracks are for the clip that is open
 for name, frames, places in DATA["tracks"]:
     track = clip.tracking.tracks.new(name=name, frame=frames[0])
     for k, (frame, place) in enumerate(zip(frames, places)):
@@ -137,11 +140,12 @@ def write_nuke_tracks(shot: Shot, path: Path) -> None:
     """Write a script with one Tracker4 node, for the undistorted plate of the format `nuke`.
 
     Pixels from the bottom left corner. A curve has keys in the frames of its track alone, and the track is enabled
-    from its first to its last frame.
+    from its first to its last frame. Signs of a name that Nuke does not take become underscores.
     """
     tracks = list(tracks_of(shot))
+    names = _nuke_names([track.name for track in tracks])
     columns = "\n".join(f"{{ {column} }}" for column in _NUKE_COLUMNS)
-    rows = "\n".join(_nuke_row(track, shot.lens.height) for track in tracks)
+    rows = "\n".join(_nuke_row(name, track, shot.lens.height) for name, track in zip(names, tracks, strict=True))
     path.write_text(
         f"Tracker4 {{\n inputs 0\n tracks {{ {{ 1 {len(_NUKE_COLUMNS)} {len(tracks)} }}\n{{ {columns}\n}}\n"
         f"{{\n{rows}\n}}\n}}\n name Tracks\n}}\n",
@@ -149,14 +153,25 @@ def write_nuke_tracks(shot: Shot, path: Path) -> None:
     )
 
 
-def _nuke_row(track: Track, height: int) -> str:
+def _nuke_names(names: list[str]) -> list[str]:
+    """Names that Nuke takes, each once."""
+    taken, found = {*names}, []
+    for name in names:
+        new = _NOT_IN_NUKE.sub("_", name)
+        while new != name and new in taken:
+            new += "_"
+        taken.add(new)
+        found.append(new)
+    return found
+
+
+def _nuke_row(name: str, track: Track, height: int) -> str:
     numbers = track.numbers.tolist()
     first, last = numbers[0], numbers[-1]
     curves = [
         " ".join(["curve", *(f"x{number} {value:.6f}" for number, value in zip(numbers, values, strict=True))])
         for values in (track.undistorted[:, 0].tolist(), (height - track.undistorted[:, 1]).tolist())
     ]
-    name = _NOT_IN_NUKE.sub("_", track.name)
     enabled, still = f"{{curve K x{first} 1 x{last + 1} 0}}", f"{{curve K x{first} 0}}"
     empty = " ".join(["{}"] * 11)
     return (
@@ -182,21 +197,22 @@ def write_camera_tracker_tracks(shot: Shot, path: Path) -> None:
 def write_blender_tracks(shot: Shot, path: Path) -> None:
     """Write a script for Blender that loads the footage as a movie clip and gives it the tracks, as markers.
 
-    Markers lie on the footage, with its distortion, in frames of the clip, whose first one is 1. Where there is no
-    footage, the tracks are for the clip that is open.
+    Markers lie on the footage, with its distortion, in frames of the clip, whose first one is 1; the clip begins in the
+    scene at the number of its first frame. Where there is no footage, the tracks are for the clip that is open.
 
     Raises:
         InputError: the footage is a folder whose images are not a numbered sequence.
     """
     footage = background(shot)
     file = footage.file(footage.first) if isinstance(footage, Sequence) else footage
-    first, size = shot.footage_start - 1, np.array([shot.lens.width, shot.lens.height])
+    start, size = shot.footage_start, np.array([shot.lens.width, shot.lens.height])
     tracks = []
     for track in tracks_of(shot):
         places = track.xy / size
         places[:, 1] = 1.0 - places[:, 1]
-        tracks.append((track.name, (track.numbers - first).tolist(), np.round(places, 9).tolist()))
-    text = json.dumps({"footage": file and file.as_posix(), "tracks": tracks}, allow_nan=False)
+        tracks.append((track.name, (track.numbers - start + 1).tolist(), np.round(places, 9).tolist()))
+    data = {"footage": file and file.as_posix(), "frame_start": start, "tracks": tracks}
+    text = json.dumps(data, allow_nan=False)
     title = '"""Gives a movie clip in Blender the tracks of a factorsfm reconstruction."""'
     path.write_text(f"{title}\n\nimport json\n\nDATA = json.loads({text!r})\n{_BLENDER}", encoding="utf-8")
 
@@ -205,14 +221,14 @@ def write_after_effects_tracks(shot: Shot, path: Path) -> None:
     """Write a script for After Effects that makes a null with keyframes of each track in the open composition.
 
     The nulls lie on the footage, with its distortion, as the format `after-effects` places it: with the optical axis
-    in the middle of the composition, and square pixels.
+    in the middle of the composition, and square pixels. Times are seconds, of the frames that its keyframes have.
     """
     lens = shot.lens
     middle = np.array([lens.width / 2, lens.height / 2])
     tracks = [
         {
             "name": track.name,
-            "times": ((track.numbers - shot.first_frame) / shot.fps).tolist(),
+            "times": (track.numbers / shot.fps).tolist(),
             "places": (middle + (track.xy - [lens.cx, lens.cy]) / [1.0, lens.pixel_aspect]).tolist(),
         }
         for track in tracks_of(shot)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from factorsfm.export.options import ExportOptions
 from factorsfm.export.shot import Shot
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
 
@@ -24,13 +25,18 @@ def write_trajectory(reconstruction: Reconstruction, path: str | Path) -> None:
 def write_tum(shot: Shot, path: Path) -> None:
     """The TUM format: ``seconds tx ty tz qx qy qz qw``, camera-to-world, OpenCV camera axes.
 
-    The time is the frame's timestamp. Without timestamps, or if the user sets a frame rate, it is the frame's index
-    divided by the frame rate. Unregistered frames have no line.
+    The time is the frame's timestamp. Without timestamps, or if the user counts the frames (`counts_frames`), it is the
+    frame's number divided by the frame rate. Unregistered frames have no line.
     """
     frames = shot.reconstruction.registered
-    timed = shot.options.fps is None and all(frame.timestamp is not None for frame in frames)
-    times = [frame.timestamp if timed else frame.index / shot.fps for frame in frames]
+    timed = not counts_frames(shot.options) and all(frame.timestamp is not None for frame in frames)
+    times = [frame.timestamp for frame in frames] if timed else [number / shot.fps for number in shot.numbers]
     _write_tum(path, [f"{time:.9f}" for time in times], frames)
+
+
+def counts_frames(options: ExportOptions) -> bool:
+    """Whether the user sets a frame rate or the number of the first frame, in place of the times of the source."""
+    return options.fps is not None or options.first_frame is not None
 
 
 def write_kitti(shot: Shot, path: Path) -> None:

@@ -125,7 +125,7 @@ def decode(video: VideoFile, selection: slice, fields: Fields = "auto") -> Itera
     Raises:
         InputError: the file cannot be opened or read any more, or interlaced frames come after others.
     """
-    apart = fields == "apart" or (fields == "auto" and video.interlaced)
+    apart = _are_taken_apart(video, fields)
     per_frame = 2 if apart else 1
     chosen = _Chosen(selection, per_frame)
     convert = _Converter(video, fields, FieldSplitter(video.top_first) if apart else None)
@@ -150,6 +150,29 @@ def decode(video: VideoFile, selection: slice, fields: Fields = "auto") -> Itera
             end = (frame.time or 0.0) - (video.start or 0.0) + video.interval
             warn_if_short(video.path, (position + 1, video.announced), (end, video.announced_seconds))
     numbers.warn(video.path)
+
+
+def _are_taken_apart(video: VideoFile, fields: Fields) -> bool:
+    return fields == "apart" or (fields == "auto" and video.interlaced)
+
+
+def are_fields(path: Path, fields: Fields) -> bool:
+    """Whether what is read of a video file are fields, as `decode` reads it, not its frames.
+
+    Raises:
+        InputError: the file is not a video, or cannot be decoded.
+    """
+    return _are_taken_apart(open_video(path), fields)
+
+
+def announced_frames(path: Path) -> int:
+    """How many frames a video file says that it has, else how many packets it has for them; nothing is decoded.
+
+    Raises:
+        InputError: the file is not a video.
+    """
+    with opened_video(path) as (container, stream):
+        return stream.frames or sum(1 for packet in container.demux(stream) if packet.size)
 
 
 def count_frames(path: Path) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import logging
 from pathlib import Path
 
 from factorsfm.export.writing import complete_file
@@ -13,13 +14,17 @@ from factorsfm.result.image_sources import footage_of
 from factorsfm.result.reading import read_result
 from factorsfm.support.errors import InputError
 
+logger = logging.getLogger(__name__)
+
 DESK = "view.html"
 
 _WIDTH = 960  # pixels of a picture: half of HD, and 240 of them are about 20 MB
 
 
 def write_desk(report: Path, footage: Path | None = None) -> Path | None:
-    """Write the report again, beside itself and with larger pictures; None where no footage is at hand for them.
+    """Write the report again, beside itself and with larger pictures.
+
+    None where no footage is at hand for them, or the folder cannot be written, of which a warning tells.
 
     Args:
         footage: the shot, see `ExportOptions.footage`.
@@ -42,6 +47,10 @@ def write_desk(report: Path, footage: Path | None = None) -> Path | None:
         return None
     data["thumbnail"] = [base64.b64encode(picture).decode() if picture else None for picture in pictures]
     data["footage"] = footage and str(footage.absolute())
-    with complete_file(report.with_name(DESK)) as file:
-        file.write_text(with_data(text, data), encoding="utf-8")
+    try:
+        with complete_file(report.with_name(DESK)) as file:
+            file.write_text(with_data(text, data), encoding="utf-8")
+    except InputError as error:  # a result of others, or on a medium that is read only, can be looked at
+        logger.warning("%s; the pictures are the small ones of %s", error, report.name)
+        return None
     return report.with_name(DESK)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -13,7 +12,7 @@ from typing import Any
 from factorsfm.export.colmap import write_colmap
 from factorsfm.export.ply import write_ply
 from factorsfm.export.trajectory import write_trajectory
-from factorsfm.export.writing import exchanged, rename_all
+from factorsfm.export.writing import REPLACING, entries_of, replace_entries, temporary_folder
 from factorsfm.frames.targets import spare_footage
 from factorsfm.report.page import failure_html, report_html
 from factorsfm.result.image_sources import footage_of
@@ -25,6 +24,7 @@ from factorsfm.result.tracks_file import write_tracks
 from factorsfm.support.errors import InputError
 from factorsfm.support.json_reading import read_json
 from factorsfm.support.json_text import json_text
+from factorsfm.support.output_files import kind_of
 from factorsfm.support.program import PROGRAM
 
 # Whatever an earlier result may have left besides summary.json; picture.png is drawn by the demo, view.html by `view`.
@@ -34,7 +34,6 @@ _ENTRIES = (
 )  # fmt: skip
 _SUMMARY = "summary.json"
 _PARTS = "part-[0-9][0-9][0-9]*"  # folders of the other parts of an image set
-_REPLACING = f".{PROGRAM}-replacing-"  # begins the name of the folder in which a result waits that replaces another
 
 
 def write_folder(reconstruction: Reconstruction, directory: str | Path) -> None:
@@ -104,8 +103,10 @@ def check_directory(directory: str | Path, *footage: object) -> None:
             place of its files.
     """
     directory = Path(directory)
+    if (kind := kind_of(directory)) not in (None, "a folder"):
+        raise InputError(f"cannot write to the output folder {directory}: it is {kind}")
     try:
-        if directory.exists() and not (_is_empty(directory) or is_earlier_result(directory)):
+        if directory.exists() and entries_of(directory) and not is_earlier_result(directory):
             raise InputError(
                 f"the output folder {directory} is not empty and holds no earlier factorsfm result; "
                 "choose a new or empty folder"
@@ -132,44 +133,18 @@ def _complete_or_nothing(directory: Path, options: Mapping[str, Any]) -> Iterato
     """
     check_directory(directory, *footage_of(options))
     existed = directory.exists()
-    # Inside a directory that exists, since that may be a mount point or the working directory.
-    place, prefix = (directory, _REPLACING) if existed else (directory.absolute().parent, f".{PROGRAM}-")
     try:
-        place.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=prefix, dir=place) as temporary:
-            folder = Path(temporary) / "result"  # a plain mkdir honours the umask, mkdtemp does not
+        with temporary_folder(directory) as temporary:
+            folder = temporary / "result"  # a plain mkdir honours the umask, the temporary folder does not
             folder.mkdir()
             yield folder
             if existed:
-                _replace_entries(directory, folder, Path(temporary) / "replaced")
+                names = {*_entries(directory), *(path.name for path in folder.iterdir())}
+                replace_entries(directory, folder, temporary / "replaced", names, _SUMMARY, _incomplete(temporary))
             else:
                 folder.rename(directory)
-        if existed:
-            for left in directory.glob(f"{_REPLACING}*"):  # by a program that was killed
-                shutil.rmtree(left, ignore_errors=True)
     except OSError as error:
         raise _unwritable(directory, error) from error
-
-
-def _replace_entries(directory: Path, new: Path, replaced: Path) -> None:
-    """Exchange the entries of a result one by one, summary.json last; an error takes everything back."""
-    summary, before = directory / _SUMMARY, replaced / _SUMMARY
-    names = {*_entries(directory), *(path.name for path in new.iterdir())} - {_SUMMARY}
-    replaced.mkdir()
-    if summary.exists():
-        shutil.copyfile(summary, before)
-    moves = [*exchanged(directory, new, replaced, sorted(names)), (new / _SUMMARY, summary)]
-    try:
-        _mark_incomplete(directory, new.parent)
-        rename_all(moves)
-    except BaseException:
-        if not all(os.path.lexists(source) for source, _ in moves):
-            raise  # not everything could be undone: the result stays incomplete
-        if before.exists():
-            before.replace(summary)
-        else:
-            summary.unlink(missing_ok=True)
-        raise
 
 
 def remove_result(directory: Path) -> None:
@@ -179,8 +154,8 @@ def remove_result(directory: Path) -> None:
         InputError: it cannot be removed.
     """
     try:
-        with tempfile.TemporaryDirectory(prefix=_REPLACING, dir=directory) as temporary:
-            _mark_incomplete(directory, Path(temporary))
+        with tempfile.TemporaryDirectory(prefix=REPLACING, dir=directory) as temporary:
+            _incomplete(Path(temporary)).replace(directory / _SUMMARY)
             for name in _entries(directory):
                 (directory / name).replace(Path(temporary) / name)
             (directory / _SUMMARY).unlink()
@@ -190,11 +165,11 @@ def remove_result(directory: Path) -> None:
         raise _unwritable(directory, error) from error
 
 
-def _mark_incomplete(directory: Path, temporary: Path) -> None:
-    """Let summary.json say that the result is incomplete, for as long as it is, also where the program is killed."""
+def _incomplete(temporary: Path) -> Path:
+    """A summary that says that the result is incomplete, for as long as it is, also where the program is killed."""
     marker = temporary / "incomplete.json"
     marker.write_text(json_text(incomplete_summary()), encoding="utf-8")
-    marker.replace(directory / _SUMMARY)
+    return marker
 
 
 def _entries(directory: Path) -> list[str]:
@@ -205,11 +180,6 @@ def _entries(directory: Path) -> list[str]:
 def _parts(directory: Path) -> list[str]:
     """Names of the folders that other parts of an image set have in that of an earlier result."""
     return [path.name for path in directory.glob(_PARTS) if is_earlier_result(path)]
-
-
-def _is_empty(directory: Path) -> bool:
-    """But for what a program has left that was killed."""
-    return all(path.name.startswith(_REPLACING) for path in directory.iterdir())
 
 
 def is_earlier_result(directory: Path) -> bool:

@@ -25,6 +25,7 @@ from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.priors.image_depth import ImageDepth
 from factorsfm.streaming.relocalization import KeyframeView
 from factorsfm.support.errors import InputError
+from factorsfm.support.output_files import replaced_file
 from factorsfm.support.status import FrameStatus
 from factorsfm.tracks.image_tracks import ImageTracks
 
@@ -49,13 +50,14 @@ def write_snapshot(path: Path, state: Mapping[str, Any]) -> None:
     body = b"".join([_MAGIC, len(header).to_bytes(8, "little"), header, *writer.chunks])
     temporary = None
     try:
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
+        target = replaced_file(path)
+        with tempfile.NamedTemporaryFile(dir=target.parent, prefix=f".{path.name}.", delete=False) as file:
             temporary = Path(file.name)
             file.write(body)
             file.write(hashlib.sha256(body).digest())
             file.flush()
             os.fsync(file.fileno())
-        temporary.replace(path)
+        temporary.replace(target)
     except OSError as error:
         if temporary is not None:
             temporary.unlink(missing_ok=True)

@@ -18,6 +18,7 @@ from factorsfm.streaming.frame_update import FrameUpdate
 from factorsfm.streaming.stream import Stream
 from factorsfm.support.context import Closing
 from factorsfm.support.errors import InputError
+from factorsfm.support.output_files import replaced_file
 
 _JPEG_QUALITY = 80
 _PATH_FRAMES = 240  # length of the shown path of live poses
@@ -169,7 +170,7 @@ class _Watched:
 
 def _writable(path: Path) -> Path:
     try:
-        path.touch()
+        replaced_file(path).touch()
     except OSError as error:
         raise InputError(f"recording {path} cannot be written: {error.strerror}") from error
     return path

@@ -132,6 +132,7 @@ def test_every_shot_its_own_result(tmp_path: Path, stream: Run, capsys: pytest.C
     assert trajectory(tmp_path / "out" / "shot-002")[:, 0].tolist() == list(range(FRAMES, 2 * FRAMES))
     assert stream("--cuts", source=tmp_path / "images") == 2
     assert_error(capsys.readouterr(), "not empty")
+    (tmp_path / "none" / ".factorsfm-ab12").mkdir(parents=True)  # of a program that was killed
     assert stream("--cuts", source=write_images(tmp_path / "black", 3 * black), output="none") == 3
     assert_error(capsys.readouterr(), "none of 1 shots", "contrast")
     assert summary(tmp_path / "none" / "shot-001")["reconstructed"] is False

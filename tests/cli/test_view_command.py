@@ -75,6 +75,29 @@ def test_the_pictures_are_large_where_the_footage_is_at_hand(
     assert not (folder / "view.html").exists()
 
 
+def test_a_folder_that_cannot_be_written_is_looked_at_with_small_pictures(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    result, folder = room(), tmp_path / "result"
+    result.options = {"source": str(write_footage(tmp_path / "shot.avi"))}
+    write_folder(result, folder)
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+    def read_only(*_: object, **__: object) -> None:
+        raise OSError(30, "Read-only file system")
+
+    with monkeypatch.context() as patch:  # permissions do not hold root back
+        patch.setattr("tempfile.TemporaryDirectory", read_only)
+        assert main(["view", str(folder), "--no-browser"]) == 0
+    assert capsys.readouterr().out.startswith(f"Open {folder / 'report.html'} in a browser")
+    reason = f"cannot write the output {folder / 'view.html'}: Read-only file system"
+    assert caplog.messages == [f"{reason}; the pictures are the small ones of report.html"]
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
 def test_other_footage_and_a_damaged_report_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_folder(room(), tmp_path / "result")
     other = write_footage(tmp_path / "other.avi", width=400)

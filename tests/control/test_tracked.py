@@ -59,13 +59,52 @@ def test_what_is_exported_comes_back_in_its_world(tmp_path: Path, format: str, n
     assert_poses(control, reconstruction, FRAMES if first is not None else names)
 
 
-def test_alembic_comes_back(tmp_path: Path) -> None:
+@pytest.mark.parametrize("rate", [0.4, 24000 / 1001, 24.0])
+def test_alembic_comes_back(tmp_path: Path, rate: float) -> None:
+    """Every second frame, and a gap: the archive states the frame rate."""
     pytest.importorskip("alembic3d", reason="alembic3d (extra alembic) is not installed")
     reconstruction = hard_reconstruction()
-    export(reconstruction, tmp_path / "a.abc", format="alembic", options=ExportOptions(fps=24000 / 1001))
-    said = {"file": "a.abc", "fps": 24000 / 1001}
-    (tmp_path / "control.json").write_text(json.dumps({"cameras": said}))
-    assert_poses(read_control(tmp_path / "control.json"), reconstruction, FRAMES)
+    export(reconstruction, tmp_path / "a.abc", format="alembic", options=ExportOptions(fps=rate))
+    assert_poses(read_control(tmp_path / "a.abc"), reconstruction, FRAMES)
+    (tmp_path / "control.json").write_text(json.dumps({"cameras": {"file": "a.abc", "fps": 2 * rate}}))
+    doubled = [1001 + pose.frame for pose in read_control(tmp_path / "control.json").poses]
+    assert doubled == [2 * (1001 + frame) for frame in FRAMES]  # what is said counts
+
+
+def sampled(path: Path, times: list[float], rate: float | None) -> None:
+    """An archive whose camera is at x = t at the time t."""
+    abc = pytest.importorskip("alembic3d.Abc", reason="alembic3d (extra alembic) is not installed")
+    import imath
+    from alembic3d import AbcCoreAbstract, AbcGeom
+
+    archive = abc.OArchive(str(path)) if rate is None else abc.CreateArchiveWithInfo(str(path), rate, "", "")
+    moments = AbcCoreAbstract.TimeVector()
+    for time in times:
+        moments.append(time)
+    kind = AbcCoreAbstract.TimeSamplingType(AbcCoreAbstract.AcyclicFlag.kAcyclic)
+    transform = AbcGeom.OXform(
+        archive.getTop(), "camera", archive.addTimeSampling(AbcCoreAbstract.TimeSampling(kind, moments))
+    )
+    AbcGeom.OCamera(transform, "shape").getSchema().set(AbcGeom.CameraSample())
+    for time in times:
+        sample = AbcGeom.XformSample()
+        sample.setTranslation(imath.V3d(time, 0.0, 0.0))
+        transform.getSchema().set(sample)
+
+
+def test_alembic_between_frames_and_without_a_rate(tmp_path: Path) -> None:
+    frames = np.arange(1, 5)
+    sampled(tmp_path / "shutter.abc", np.ravel(frames[:, None] + [-0.25, 0.0, 0.25]) / 24, 24.0)
+    poses = read_control(tmp_path / "shutter.abc").poses
+    assert [pose.frame for pose in poses] == [0, 1, 2, 3]
+    np.testing.assert_allclose([pose.position for pose in poses], [[k / 24, 0, 0] for k in frames], atol=1e-9)
+    sampled(tmp_path / "silent.abc", (1001 + 2 * frames) / 24, None)
+    silent = read_control(tmp_path / "silent.abc")
+    with pytest.raises(InputError, match=r"can name the first_frame, and the fps of an Alembic archive$"):
+        find_frames(silent, [(k, f"{k:06d}") for k in range(9)])
+    (tmp_path / "control.json").write_text(json.dumps({"cameras": {"file": "silent.abc", "fps": 24}}))
+    named = find_frames(read_control(tmp_path / "control.json"), [(k, f"{k:06d}") for k in range(9)])
+    assert named == {2: 2, 4: 4, 6: 6, 8: 8}
 
 
 def test_usd_of_another_unit_and_below_a_moving_parent(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """The files of a result, read back by pycolmap, by a plain parser and bit by bit."""
 
 import json
+import os
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +11,7 @@ import pycolmap
 import pytest
 
 from factorsfm.camera.files import read_camera
-from factorsfm.export import write_colmap, write_ply, write_trajectory
+from factorsfm.export import export, write_colmap, write_ply, write_trajectory
 from factorsfm.report.result_folder import check_directory, write_failure, write_folder
 from factorsfm.result.reconstruction import Reconstruction
 from factorsfm.support.errors import InputError
@@ -122,6 +123,32 @@ def test_colmap_image_without_observations_and_names_with_white_space(tmp_path: 
     assert len(model.image(15).points2D) == 40
 
 
+@pytest.mark.parametrize("space", [False, True])
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
+def test_colmap_files_that_are_cut_off_are_no_success(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, space: bool
+) -> None:
+    reconstruction = build()
+    if space:  # text cannot hold the name, and the binary files are written beside it
+        reconstruction.frames[0].name = "mein Schuß.jpg"
+    write, sizes = pycolmap.Reconstruction.write_binary, {}
+    lost = 0
+
+    def cut_off(model: pycolmap.Reconstruction, folder: Path) -> None:
+        write(model, folder)
+        sizes[name] = (folder / name).stat().st_size
+        os.truncate(folder / name, sizes[name] - lost)
+
+    monkeypatch.setattr(pycolmap.Reconstruction, "write_binary", cut_off)
+    format = "colmap" if space else "colmap-binary"
+    export(reconstruction, tmp_path / "whole", format=format)
+    assert pycolmap.Reconstruction(tmp_path / "whole").compute_num_observations() == 200
+    lost = 1
+    with pytest.raises(InputError, match=f"only {sizes[name] - 1} of {sizes[name]} bytes of {name} are written"):
+        export(reconstruction, tmp_path / "short", format=format)
+    assert [path.name for path in tmp_path.iterdir()] == ["whole"]
+
+
 def test_colmap_is_fast(tmp_path: Path) -> None:
     reconstruction = build(frames=80, points=2000, unregistered=())
     start = time.process_time()
@@ -210,6 +237,20 @@ def test_unwritable_output_is_an_input_error(tmp_path: Path) -> None:
             with pytest.raises(InputError, match=r"cannot write to the output folder .*file"):
                 call()
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize("kind", ["a pipe", "a link that leads nowhere"])
+def test_a_result_takes_the_place_of_nothing_but_a_folder(tmp_path: Path, kind: str) -> None:
+    output = tmp_path / "output"
+    if kind == "a pipe":
+        os.mkfifo(output)
+    else:
+        output.symlink_to("absent")
+    mode = output.lstat().st_mode
+    for call in (lambda: write_folder(build(), output), lambda: check_directory(output)):
+        with pytest.raises(InputError, match=rf"cannot write to the output folder .*output: it is {kind}"):
+            call()
+    assert [(path.name, path.lstat().st_mode) for path in tmp_path.iterdir()] == [("output", mode)]
 
 
 @pytest.mark.parametrize("existing", [False, True])

@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import re
 import subprocess
 import sys
@@ -15,6 +16,7 @@ import pycolmap
 import pytest
 from numpy.typing import NDArray
 
+from factorsfm.cli.main import main
 from factorsfm.export import FORMATS, ExportOptions, export
 from factorsfm.support.errors import InputError
 from tests.export_problems import (
@@ -26,7 +28,8 @@ from tests.export_problems import (
     seen_points,
     true_world_from_film,
 )
-from tests.exported_files import after_effects_tracks, nuke_curves, nuke_nodes
+from tests.exported_files import after_effects_tracks, exported, nuke_curves, nuke_nodes
+from tests.video_files import moving_texture, write_video
 
 Array = NDArray[np.float64]
 
@@ -57,7 +60,7 @@ def in_film_camera(world_from_film: Array, points: Array) -> Array:
 def test_colmap_in_pycolmap(tmp_path: Path, format: str, up_axis: str) -> None:
     reconstruction = hard_reconstruction()
     export(reconstruction, tmp_path / "out", format=format, options=ExportOptions(up_axis=up_axis, scale=HAND))
-    suffixes = {path.suffix for path in (tmp_path / "out").iterdir()}
+    suffixes = {Path(name).suffix for name in exported(tmp_path / "out")}
     assert suffixes == {".txt" if format == "colmap" else ".bin"}
     model = pycolmap.Reconstruction(tmp_path / "out")
     (camera,) = model.cameras.values()
@@ -88,6 +91,30 @@ def test_tum_in_evo(tmp_path: Path) -> None:
 def test_tum_times_follow_a_given_frame_rate(tmp_path: Path) -> None:
     export(hard_reconstruction(), tmp_path / "t.txt", format="tum", options=ExportOptions(fps=20))
     np.testing.assert_allclose(np.loadtxt(tmp_path / "t.txt")[:, 0], [0.5, 0.6, 0.7, 0.9, 1.0], atol=1e-9)
+
+
+def test_tum_times_follow_a_given_first_frame(tmp_path: Path) -> None:
+    numbers = np.array([10, 12, 14, 18, 20])
+    export(hard_reconstruction(), tmp_path / "t.txt", format="tum", options=ExportOptions(first_frame=500, fps=20))
+    np.testing.assert_allclose(np.loadtxt(tmp_path / "t.txt")[:, 0], (500 + numbers) / 20, atol=1e-9)
+    export(hard_reconstruction(), tmp_path / "t.txt", format="tum", options=ExportOptions(first_frame=0))
+    times = np.loadtxt(tmp_path / "t.txt")[:, 0]
+    timed = [frame.timestamp for frame in hard_reconstruction().registered]  # at 48 frames a second, from 0 on
+    np.testing.assert_allclose(times, numbers / 48, atol=1e-9)
+    assert np.abs(times - timed).min() > 0.1
+
+
+@pytest.mark.parametrize(("options", "told"), [([], False), (["--fps", "25"], True), (["--first-frame", "0"], True)])
+def test_tum_keeps_uneven_times_or_says_that_it_does_not(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], told: bool
+) -> None:
+    reconstruction = hard_reconstruction()
+    for k, frame in enumerate(reconstruction.frames):
+        frame.timestamp = 0.04 * frame.index + 0.04 * (k > 2)
+    reconstruction.write(tmp_path / "result")
+    command = ["export", str(tmp_path / "result"), "--format", "tum", "--output", str(tmp_path / "t.txt")]
+    assert main([*command, *options]) == 0
+    assert ("its frames come at uneven times" in capsys.readouterr().out) == told
 
 
 def test_kitti_in_evo_and_the_gap(tmp_path: Path) -> None:
@@ -184,12 +211,7 @@ def test_nuke_script_projects_as_pycolmap(tmp_path: Path) -> None:
     reconstruction = hard_reconstruction()
     options = ExportOptions(scale=HAND, sensor_width=24.89, fps=25, first_frame=101)
     export(reconstruction, tmp_path / "out", format="nuke", options=options)
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {
-        "camera.nk",
-        "points.obj",
-        "undistort.exr",
-        "distort.exr",
-    }
+    assert exported(tmp_path / "out") == {"camera.nk", "points.obj", "undistort.exr", "distort.exr"}
     nodes = nuke_nodes((tmp_path / "out" / "camera.nk").read_text())
     root, camera = nodes["Root"], nodes["Camera"]
     assert (root["first_frame"], root["last_frame"], root["fps"]) == ("111", "121", "25")
@@ -236,7 +258,7 @@ def test_nuke_script_wiring(tmp_path: Path) -> None:
         "PointsOnPlate": ["Plate", "Distort"],
     }
     assert straight == {"PointsOnUndistortedPlate": ["Plate", "Points", "Camera"]}
-    assert {path.name for path in (tmp_path / "straight").iterdir()} == {"camera.nk", "points.obj"}
+    assert exported(tmp_path / "straight") == {"camera.nk", "points.obj"}
     plate = nuke_nodes((tmp_path / "bent" / "camera.nk").read_text())["Plate"]
     assert plate["file"] == f'"{footage.as_posix()}/shot.%04d.png"'
     assert (plate["first"], plate["last"]) == ("1001", "1030")
@@ -313,6 +335,39 @@ def test_after_effects_projects_as_pycolmap(tmp_path: Path) -> None:
         np.testing.assert_allclose(in_composition, layer, atol=PIXEL)
     film = np.array(found) @ np.diag([1, -1, -1, 1])
     assert_same_cameras(film, true_world_from_film(reconstruction, "-y", 100.0))
+
+
+# Blender, whose limits are those of its own properties; tests/export/test_blender.py runs the script in it
+
+
+@pytest.mark.parametrize(
+    ("rate", "whole"), [(0.001, 1), (0.4, 1), (0.5, 1), (1.4, 1), (30000 / 1001, 30), (1e6, 32767)]
+)
+def test_blender_takes_every_frame_rate(tmp_path: Path, rate: float, whole: int) -> None:
+    export(hard_reconstruction(), tmp_path / "a.py", format="blender", options=ExportOptions(fps=rate))
+    ((fps, base),) = re.findall(r'"fps": \[(\d+), ([^]]+)\]', (tmp_path / "a.py").read_text())
+    assert int(fps) == whole
+    assert int(fps) / float(base) == pytest.approx(rate, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"first_frame": -11}, "the numbers -1 to 9, and Blender has 0 to 1048574; another first frame"),
+        ({"first_frame": 1048555}, "the numbers 1048565 to 1048575, and Blender has 0 to 1048574"),
+        ({"sensor_width": 1.06}, "0.994 mm on a sensor of 1.06 mm, and Blender has 1 mm and more; a larger sensor"),
+    ],
+)
+def test_blender_is_not_given_what_it_would_change(tmp_path: Path, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        export(hard_reconstruction(), tmp_path / "a.py", format="blender", options=ExportOptions(**options))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("options", [{"first_frame": -10}, {"first_frame": 1048554}, {"sensor_width": 1.07}])
+def test_blender_is_given_all_that_it_takes(tmp_path: Path, options: dict[str, Any]) -> None:
+    export(hard_reconstruction(), tmp_path / "a.py", format="blender", options=ExportOptions(**options))
+    assert (tmp_path / "a.py").exists()
 
 
 # USD and Alembic
@@ -476,7 +531,7 @@ def test_undistorted_plates(tmp_path: Path, movie: bool) -> None:
         originals = [capture.read()[1] for _ in originals]
     options = ExportOptions(footage=footage, first_frame=1)
     export(reconstruction, tmp_path / "out", format="undistorted", options=options)
-    plates = sorted((tmp_path / "out").iterdir())
+    plates = [tmp_path / "out" / name for name in sorted(exported(tmp_path / "out"))]
     assert [path.name for path in plates] == ["plate.0001.png", "plate.0002.png", "plate.0003.png"]
     matrix = np.array([[600, 0, 289.5], [0, 1200, 261.5], [0, 0, 1]], float)  # pixel centres at integers
     maps = cv2.initUndistortRectifyMap(
@@ -533,6 +588,24 @@ def test_every_format_is_all_or_nothing_and_replaces_itself(
     assert {p: p.read_bytes() for p in place.rglob("*") if p.is_file()} == before
 
 
+@pytest.mark.parametrize("format", FORMATS)
+def test_the_first_frame_counts_where_the_docs_say_so(tmp_path: Path, format: str) -> None:
+    for module in {"usd": ["pxr"], "alembic": ["alembic3d"]}.get(format, []):
+        pytest.importorskip(module)
+    table = (Path(__file__).parents[2] / "docs" / "export.md").read_text()
+    (said,) = re.findall(rf"^\| `{format}` \|.*\| (\S+) \|$", table, re.MULTILINE)
+    footage = noise_images(tmp_path / "shot", 1) if format in ("undistorted", "tracks-blender") else None
+    written = []
+    for first_frame in (0, 500):
+        path = path_of(format, tmp_path / str(first_frame))
+        export(
+            hard_reconstruction(), path, format=format, options=ExportOptions(first_frame=first_frame, footage=footage)
+        )
+        files = [file for file in sorted(path.parent.rglob("*")) if file.is_file()]
+        written.append({file.relative_to(path.parent): file.read_bytes() for file in files})
+    assert (written[0] != written[1]) == (said != "–")
+
+
 @pytest.mark.parametrize(
     "name", ["../x.png", "a/../../x.png", "/x.png", "C:x.png", "c:\\x.png", "\\\\host\\x", "..\\x.png"]
 )
@@ -579,14 +652,14 @@ def test_an_error_while_an_export_is_replaced_leaves_the_earlier_one(
 
         return renamed
 
-    for most in range(6):  # transforms.json, points.ply and images/, each out and in
+    for most in range(8):  # transforms.json, points.ply and images/, each out and in, and the list before and after
         monkeypatch.setattr(Path, "replace", failing_after(most))
         with pytest.raises(InputError, match="Input/output error"):
             export(hard_reconstruction(), out, format="nerfstudio", options=options)
         assert {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()} == before
-    monkeypatch.setattr(Path, "replace", failing_after(6))
+    monkeypatch.setattr(Path, "replace", failing_after(8))
     export(hard_reconstruction(), out, format="nerfstudio", options=options)
-    assert len(renames) == 6
+    assert len(renames) == 8
 
 
 def test_output_that_holds_something_else_is_left_alone(tmp_path: Path) -> None:
@@ -602,20 +675,46 @@ def test_output_that_holds_something_else_is_left_alone(tmp_path: Path) -> None:
     assert [(p.name, p.read_text()) for p in folder.iterdir()] == [("mine.txt", "x")]
 
 
+@pytest.mark.parametrize("format", ["ply", "colmap"])
+def test_output_that_is_neither_file_nor_folder_is_left_alone(tmp_path: Path, format: str) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for name, target in (("to_pipe", "pipe"), ("to_nothing", "absent"), ("to_itself", "to_itself")):
+        (tmp_path / name).symlink_to(target)
+    before = {path.name: path.lstat().st_mode for path in tmp_path.iterdir()}
+    for name, kind in (("pipe", "pipe"), ("to_pipe", "pipe"), ("to_nothing", "link"), ("to_itself", "link")):
+        with pytest.raises(InputError, match=rf"{name}:? (it )?is a {kind}.*(file is expected|format is a folder)$"):
+            export(hard_reconstruction(), tmp_path / name, format=format)
+        assert {path.name: path.lstat().st_mode for path in tmp_path.iterdir()} == before
+
+
+def test_output_at_a_link_is_where_it_leads_to(tmp_path: Path) -> None:
+    export(hard_reconstruction(), tmp_path / "expected", format="tum")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "file").write_text("an earlier one")
+    for name, target in (("to_file", "folder/file"), ("to_folder", "folder")):
+        (tmp_path / name).symlink_to(target)
+    export(hard_reconstruction(), tmp_path / "to_file", format="tum")
+    assert (tmp_path / "to_file").readlink() == Path("folder/file")
+    assert (tmp_path / "folder" / "file").read_bytes() == (tmp_path / "expected").read_bytes()
+    (tmp_path / "folder" / "file").unlink()
+    export(hard_reconstruction(), tmp_path / "to_folder", format="colmap")
+    assert (tmp_path / "to_folder").readlink() == Path("folder")
+    assert pycolmap.Reconstruction(tmp_path / "folder").num_reg_images() == 5
+
+
 def test_footage_must_be_a_numbered_sequence_or_is_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     footage = noise_images(tmp_path / "shot", 21)
     (footage / "shot.1005.png").rename(footage / "other.1005.png")
-    with pytest.raises(InputError, match="not numbered alike"):
+    with pytest.raises(InputError, match=r"holds other\.1005\.png beside the sequence shot"):
         export(hard_reconstruction(), tmp_path / "a", format="blender", options=ExportOptions(footage=footage))
     reconstruction = hard_reconstruction("PINHOLE", options={"source": str(footage)})
     export(reconstruction, tmp_path / "b", format="nuke")
-    assert "not numbered alike" in caplog.text
+    assert "there is no plate" in caplog.text
     assert nuke_nodes((tmp_path / "b" / "camera.nk").read_text())["Plate"]["class"] == "Constant"
 
 
 def test_source_is_the_footage_where_none_is_given(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    footage = tmp_path / "a [1] $x.mp4"
-    footage.write_bytes(b"not looked at")
+    footage = write_video(tmp_path / "a [1] $x.mp4", moving_texture(21))
     export(hard_reconstruction(options={"source": str(footage)}), tmp_path / "out", format="nuke")
     plate = nuke_nodes((tmp_path / "out" / "camera.nk").read_text())["Plate"]
     assert plate["file"] == '"' + str(footage).replace("[", r"\[").replace("$", r"\$") + '"'
@@ -632,21 +731,40 @@ def test_footage_that_has_gone_is_named(tmp_path: Path, caplog: pytest.LogCaptur
     assert f"the footage {gone} is not where it was, and no plate is written; --footage says where" in caplog.text
 
 
-def test_frames_that_were_added_from_elsewhere_are_not_in_the_footage(tmp_path: Path) -> None:
-    footage = tmp_path / "shot.mp4"
-    footage.write_bytes(b"not looked at")
+def test_frames_that_were_added_from_elsewhere_are_not_in_the_footage(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    footage = write_video(tmp_path / "shot.mp4", moving_texture(15))
     options = {"source": str(footage), "added": [{"source": str(tmp_path / "stills"), "first": 15}]}
     export(hard_reconstruction(options=options), tmp_path / "out", format="nuke")
     nodes = nuke_nodes((tmp_path / "out" / "camera.nk").read_text())
     assert (nodes["Plate"]["first"], nodes["Plate"]["last"]) == ("1", "15")
     assert nodes["Root"]["last_frame"] == "1021"
+    assert "of the frames of the result; it lacks" not in caplog.text
+
+
+def test_a_source_that_cannot_be_decoded_is_no_plate(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    footage = tmp_path / "shot.mp4"
+    footage.write_bytes(b"no video")
+    for options, format in ((None, "nuke"), (None, "blender"), (ExportOptions(footage=footage), "nuke")):
+        result = hard_reconstruction("PINHOLE", options={"source": str(footage)})
+        if options is not None:
+            with pytest.raises(InputError, match=r"shot\.mp4 cannot be decoded as a video"):
+                export(result, tmp_path / "refused", format=format, options=options)
+        else:
+            export(result, tmp_path / format, format=format)
+            (message,) = caplog.messages
+            assert message.startswith(f"there is no plate: {footage} cannot be decoded as a video")
+            caplog.clear()
+    assert nuke_nodes((tmp_path / "nuke" / "camera.nk").read_text())["Plate"]["class"] == "Constant"
+    assert {path.name for path in tmp_path.iterdir()} == {"shot.mp4", "nuke", "blender"}
 
 
 def test_output_can_be_the_working_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     for _ in range(2):
         export(hard_reconstruction(), ".", format="colmap")
-    assert {path.name for path in tmp_path.iterdir()} == {"cameras.txt", "images.txt", "points3D.txt"}
+    assert exported(tmp_path) == {"cameras.txt", "images.txt", "points3D.txt"}
 
 
 @pytest.mark.parametrize(

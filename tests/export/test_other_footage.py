@@ -19,8 +19,8 @@ from factorsfm.report.overlay import write_overlay
 from factorsfm.result.reconstruction import Reconstruction
 from factorsfm.support.errors import InputError
 from tests.export_problems import hard_reconstruction, noise_images
-from tests.exported_files import after_effects_tracks, nuke_nodes
-from tests.video_files import interlaced, moving_texture
+from tests.exported_files import after_effects_tracks, exported, nuke_nodes
+from tests.video_files import interlaced, moving_texture, write_video
 
 
 def numbered(first: int = 1001) -> Reconstruction:
@@ -140,6 +140,85 @@ def test_interlaced_footage_is_read_as_the_result_was(tmp_path: Path) -> None:
         write_overlay(hard_reconstruction(options={"fields": "auto"}), tmp_path / "auto.avi", footage)
 
 
+@pytest.mark.parametrize("format", ["nuke", "blender", "tracks-blender"])
+@pytest.mark.parametrize(
+    ("fields", "marked", "is_plate"),
+    [
+        ("auto", True, False),
+        ("apart", True, False),
+        ("apart", False, False),
+        ("blend", True, True),
+        ("auto", False, True),
+    ],
+)
+def test_a_movie_whose_fields_were_solved_is_no_plate(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, format: str, fields: str, marked: bool, is_plate: bool
+) -> None:
+    moments = moving_texture(48, size=(640, 480))
+    path = tmp_path / "shot.mp4"
+    footage = interlaced(path, moments) if marked else write_video(path, moments[::2])
+    solved = hard_reconstruction("PINHOLE", options={"source": str(footage), "fields": fields})
+    export(solved, tmp_path / "out", format=format)
+    script = (tmp_path / "out" / "camera.nk" if format == "nuke" else tmp_path / "out").read_text()
+    assert (str(footage) in script) == is_plate
+    if is_plate:
+        assert caplog.messages == []
+        return
+    (message,) = caplog.messages
+    assert message == (
+        f"there is no plate: {footage} is interlaced, and the result is of its fields, twice the frames of half the "
+        "lines; the format undistorted writes plates of the fields"
+    )
+    half = pycolmap.Camera(model="PINHOLE", width=640, height=240, params=[600, 600, 290, 131])
+    solved, options = replace(solved, camera=half), ExportOptions(footage=footage)
+    with pytest.raises(InputError, match="is of its fields, twice the frames"):
+        export(solved, tmp_path / "new", format=format, options=options)
+    export(solved, tmp_path / "plates", format="undistorted", options=options)
+    assert exported(tmp_path / "plates") == {f"plate.{1001 + k}.png" for k in range(48)}
+
+
+LACKS = "the footage {} has {} of the 6 frames of the result; it lacks {}"
+
+
+@pytest.mark.parametrize("format", ["nuke", "blender", "tracks-blender", "undistorted"])
+@pytest.mark.parametrize(
+    ("solved", "kind", "count", "said"),
+    [
+        (numbered(), "sequence", 21, None),
+        (numbered(), "sequence", 20, (5, "1021")),
+        (numbered(), "sequence", 14, (2, "1015 to 1021")),
+        (hard_reconstruction(), "sequence", 14, (2, "1015 to 1021")),
+        (hard_reconstruction(), "movie", 21, None),
+        (hard_reconstruction(), "movie", 14, (2, "{} to {}")),
+        (numbered(), "movie", 20, (5, "1021")),
+    ],
+)
+def test_footage_that_lacks_frames_is_told(
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    format: str,
+    solved: Reconstruction,
+    kind: str,
+    count: int,
+    said: tuple[int, str] | None,
+) -> None:
+    footage = noise_images(tmp_path / "shot", count) if kind == "sequence" else movie(tmp_path / "shot.avi", count)
+    straight = replace(solved, camera=hard_reconstruction("PINHOLE").camera)
+    export(straight, tmp_path / "out", format=format, options=ExportOptions(footage=footage))
+    first = 1 if "blender" in format else 1001
+    wanted = [] if said is None else [LACKS.format(footage, said[0], said[1].format(first + 14, first + 20))]
+    assert caplog.messages == wanted
+
+
+def test_plates_that_are_not_written_for_gaps_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    footage = noise_images(tmp_path / "shot", 21)
+    for number in (1011, 1014, 1015):
+        (footage / f"shot.{number}.png").unlink()
+    options = ExportOptions(footage=footage, first_frame=1)
+    export(numbered(), tmp_path / "out", format="undistorted", options=options)
+    assert caplog.messages == [LACKS.format(footage, 4, "11, 15")]  # 14 is no frame of the result
+
+
 @pytest.mark.parametrize("format", ["nuke", "blender", "nerfstudio", "chan", "undistorted"])
 def test_another_aspect_ratio_is_refused_with_the_numbers(tmp_path: Path, format: str) -> None:
     footage = noise_images(tmp_path / "wide", 1, 640, 360)
@@ -202,11 +281,11 @@ def test_undistorted_plates_keep_the_bits_of_the_originals(tmp_path: Path, kind:
         cv2.imwrite(str(folder / "plate.1001.png"), original)
     solved = numbered()
     export(solved, tmp_path / "out", format="undistorted", options=ExportOptions(footage=folder))
-    (plate,) = (tmp_path / "out").iterdir()
-    assert plate.name == ("plate.1001.exr" if kind == "half" else "plate.1001.png")
+    (name,) = exported(tmp_path / "out")
+    assert name == ("plate.1001.exr" if kind == "half" else "plate.1001.png")
     matrix = np.array([[600, 0, 289.5], [0, 1200, 261.5], [0, 0, 1]], float)
     maps = cv2.initUndistortRectifyMap(matrix, solved.camera.params[4:], np.eye(3), matrix, (640, 480), cv2.CV_32FC1)
     expected = cv2.remap(original, *maps, cv2.INTER_CUBIC).astype(np.float64)
-    found = read_pixels(plate)
+    found = read_pixels(tmp_path / "out" / name)
     assert found.dtype == (np.float16 if kind == "half" else np.uint16)
     np.testing.assert_allclose(found[50:-50, 50:-50], expected[50:-50, 50:-50], rtol=4e-3, atol=0.01)

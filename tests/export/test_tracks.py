@@ -4,6 +4,7 @@ import csv
 import json
 import re
 import types
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,11 @@ import numpy as np
 import pytest
 
 from factorsfm.export import ExportOptions, export
+from factorsfm.mending.user_tracks import read_tracks
+from factorsfm.result.reconstruction import Reconstruction
 from tests.exact_result import build
 from tests.export_problems import noise_images
+from tests.exported_files import after_effects_tracks
 
 FIRST = 1001
 HEIGHT, WIDTH = 480, 640
@@ -95,6 +99,19 @@ def test_nuke_tracks_lie_on_the_undistorted_plate(tmp_path: Path) -> None:
     compare(found, slice(2, 4), 1e-5)
 
 
+def test_nuke_tracks_keep_different_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where they differ in signs alone that Nuke does not take."""
+    others = [f"other {k}" for k in range(35)]
+    monkeypatch.setattr(Reconstruction, "track_names", lambda _: ["a[1]", "a{1}", "a_1_", "$", "b c", *others])
+    written(tmp_path, "tracks-nuke")
+    found = read_tracks(tmp_path / "out", first_frame=FIRST).tracks
+    assert [track.name for track in found] == ["a_1__", "a_1___", "a_1_", "_", "b c", *others]
+    truth = expected()
+    for number, track in enumerate(found, 101):
+        flat = [truth[f"track_{number:05d}", FIRST + frame][2:] for frame in track.frames.tolist()]
+        np.testing.assert_allclose(track.xy * [1, -1] + [0.5, HEIGHT], flat, atol=1e-5)
+
+
 def test_after_effects(tmp_path: Path) -> None:
     text = written(tmp_path, "tracks-after-effects", fps=25)
     data = json.loads(re.findall(r"var DATA = (.*);\n", text)[0])
@@ -103,8 +120,24 @@ def test_after_effects(tmp_path: Path) -> None:
         for time, (x, y) in zip(track["times"], track["places"], strict=True):
             # As its footage is placed: the optical axis in the middle, pixels square.
             place = [x - WIDTH / 2 + 321, (y - HEIGHT / 2) * 510 / 500 + 239]
-            found[track["name"], FIRST + round(25 * time)] = place
+            found[track["name"], round(25 * time)] = place
     compare(found, slice(2))
+
+
+@pytest.mark.parametrize("first_frame", [None, 0, 86400])
+def test_after_effects_has_camera_and_tracks_at_the_same_times(tmp_path: Path, first_frame: int | None) -> None:
+    """Also of a numbered sequence, which both count from the start of the composition."""
+    result = build()
+    frames = [replace(frame, index=1001 + k) for k, frame in enumerate(result.frames)]
+    result = replace(result, frames=frames, options={"first_number": 1001})
+    options = ExportOptions(first_frame=first_frame, fps=25)
+    export(result, tmp_path / "camera", format="after-effects", options=options)
+    export(result, tmp_path / "tracks.jsx", format="tracks-after-effects", options=options)
+    _, camera = after_effects_tracks((tmp_path / "camera" / "camera.txt").read_text())
+    keys = list(camera["Transform\tPosition"])
+    assert keys == [(first_frame or 0) + k for k in (0, 1, 2, 4, 5)]
+    for track in json.loads(re.findall(r"var DATA = (.*);\n", (tmp_path / "tracks.jsx").read_text())[0])["tracks"]:
+        np.testing.assert_allclose(track["times"], np.array(keys) / 25, rtol=1e-12)
 
 
 def test_blender(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -126,8 +159,9 @@ def test_blender(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data = types.SimpleNamespace(movieclips=types.SimpleNamespace(load=lambda path: clip))
     monkeypatch.setitem(__import__("sys").modules, "bpy", types.SimpleNamespace(data=data))
     exec(compile(script, "tracks.py", "exec"), {})
+    assert clip.frame_start == FIRST  # where frame 1 of the clip is shown
     found = {
-        (name, FIRST - 1 + number): [marker.co[0] * WIDTH, (1 - marker.co[1]) * HEIGHT]
+        (name, clip.frame_start - 1 + number): [marker.co[0] * WIDTH, (1 - marker.co[1]) * HEIGHT]
         for name, mine in markers.items()
         for number, marker in mine.items()
         if not marker.mute

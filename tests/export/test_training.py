@@ -18,6 +18,7 @@ from factorsfm.result.reconstruction import Reconstruction, RollingShutter
 from factorsfm.support.errors import InputError
 from tests.exact_result import build
 from tests.export_problems import noise_images
+from tests.exported_files import exported
 
 Array = NDArray[np.float64]
 
@@ -127,6 +128,31 @@ def test_nerfstudio_has_a_mask_for_every_image(shot: Reconstruction, tmp_path: P
         assert_mask(mask, seen, np.empty((0, 2)))
 
 
+@pytest.mark.parametrize("several", [False, True])
+def test_lenses_that_nerfstudio_does_not_take_are_undistorted(
+    shot: Reconstruction, tmp_path: Path, several: bool
+) -> None:
+    if several:
+        fisheye = pycolmap.Camera(model="OPENCV_FISHEYE", width=640, height=480, params=[*PARAMS[:4], 0, 0, 0, 0])
+        lenses = [shot.camera, *(len(shot.frames) - 1) * [fisheye]]
+        frames = [replace(frame, camera=lens) for frame, lens in zip(shot.frames, lenses, strict=True)]
+        result = replace(shot, frames=frames)
+        message = "takes lenses of one model, not OPENCV and OPENCV_FISHEYE together"
+    else:
+        full = pycolmap.Camera(model="FULL_OPENCV", width=640, height=480, params=[*PARAMS, 0.02, 0, 0, 0])
+        result = replace(shot, camera=full)
+        message = "does not know the lens model FULL_OPENCV; it knows .*, OPENCV_FISHEYE"
+    with pytest.raises(InputError, match=f"{message}; --undistorted writes images without distortion"):
+        export(result, tmp_path / "out", format="nerfstudio")
+    assert not list(tmp_path.iterdir())
+    export(result, tmp_path / "out", format="nerfstudio", options=ExportOptions(undistorted=True))
+    content = json.loads((tmp_path / "out" / "transforms.json").read_text())
+    assert content["camera_model"] == "OPENCV"
+    for lens in content["frames"] if several else [content]:
+        assert [lens[name] for name in ("k1", "k2", "p1", "p2")] == [0, 0, 0, 0]
+        assert (tmp_path / "out" / content["frames"][0]["file_path"]).exists()
+
+
 def test_masks_that_are_given_and_objects_are_ignored_too(shot: Reconstruction, tmp_path: Path) -> None:
     (tmp_path / "masks").mkdir()
     corner = np.zeros((48, 64), np.uint8)
@@ -155,7 +181,7 @@ def test_what_is_not_bent_is_copied_and_nothing_moving_has_no_masks(shot: Recons
     for frame in shot.registered:
         copy = tmp_path / "out" / "images" / frame.name
         assert copy.read_bytes() == (Path(shot.options["source"]) / frame.name).read_bytes()
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"images", "sparse"}
+    assert exported(tmp_path / "out") == {"images", "sparse"}
 
 
 def test_images_that_exif_data_turn_are_written_upright(tmp_path: Path) -> None:

@@ -239,6 +239,20 @@ def test_a_file_that_is_no_snapshot_is_not_replaced(tmp_path):
         assert read_snapshot(tmp_path / name) == {"a": 1}
 
 
+def test_a_snapshot_replaces_files_alone(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(InputError, match="pipe cannot be written: it is a pipe, and a file is expected"):
+        write_snapshot(tmp_path / "pipe", {})
+    assert (tmp_path / "pipe").is_fifo()
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "state").touch()
+    (tmp_path / "link").symlink_to("folder/state")
+    write_snapshot(tmp_path / "link", {"a": 1})
+    assert read_snapshot(tmp_path / "folder" / "state") == {"a": 1}
+    assert (tmp_path / "link").is_symlink()
+    assert len([*tmp_path.rglob("*")]) == 4
+
+
 def test_values_survive(tmp_path):
     state = {
         "none": None, "number": 1, "real": 0.1, "nan": float("nan"), "text": "Größe", "truth": True,

@@ -1,5 +1,6 @@
 """What a stream shows: recorded for the viewer, and read back."""
 
+import os
 import sys
 
 import numpy as np
@@ -87,6 +88,9 @@ def test_without_the_extra(monkeypatch, tmp_path):
 def test_a_file_that_cannot_be_written(tmp_path):
     with pytest.raises(InputError, match=r"recording .* cannot be written: No such file or directory"):
         open_viewer(record=tmp_path / "absent" / "shot.rrd")
+    os.mkfifo(tmp_path / "pipe")  # to open it would wait for somebody who reads
+    with pytest.raises(InputError, match=r"recording .* cannot be written: it is a pipe, and a file is expected"):
+        open_viewer(record=tmp_path / "pipe")
 
 
 def test_a_prior_without_any_value_is_shown_dark(tmp_path):
