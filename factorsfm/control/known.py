@@ -6,8 +6,9 @@ with its standard deviation (`sigma`). Frames are named by their name, with or w
 
 from __future__ import annotations
 
+import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import PurePath
 from typing import Any, Protocol
@@ -264,18 +265,51 @@ def find_frames(control: Control, frames: Sequence[tuple[int, str]]) -> dict[Fra
     """Position of each frame of the control among those with these indices and names.
 
     Raises:
-        InputError: a frame is not there that may not be left out.
+        InputError: a frame is not there that may not be left out, or is meant twice where different ones are expected.
     """
-    by_name: dict[FrameKey, int] = {}
-    for position, (index, _) in enumerate(frames):
-        by_name.update({index: position, str(index): position})
-    by_name.update({PurePath(name).stem: position for position, (_, name) in enumerate(frames)})
-    by_name.update({name: position for position, (_, name) in enumerate(frames)})
-    control = control.within(by_name.keys())
-    missing = [key for key in control.frames if key not in by_name]
+    found = _positions(control.frames, frames)
+    control = control.within(found.keys())
+    missing = [key for key in control.frames if key not in found]
     if missing:
         raise InputError(f"control: there is no frame {missing[0]!r} among the {len(frames)} frames")
-    return {key: by_name[key] for key in control.frames}
+    _check_different([pose.frame for pose in control.poses], found)
+    for keys in (*(point.pixels for point in control.points), *(distance.frames for distance in control.distances)):
+        _check_different(keys, found)
+    return {key: found[key] for key in control.frames}
+
+
+def _positions(keys: Iterable[FrameKey], frames: Sequence[tuple[int, str]]) -> dict[FrameKey, int]:
+    """Position of each key that is a frame's index or its name, without its suffix or with another one."""
+    stems = [_stem(PurePath(name).name) for _, name in frames]
+    counts = Counter(stems)  # of a.jpg and a.png nobody knows which one "a" is
+    by_stem: dict[FrameKey, int] = {stem: k for k, stem in enumerate(stems) if counts[stem] == 1}
+    as_it_is, without_suffix = dict[FrameKey, int](), dict[FrameKey, int]()
+    for position, ((index, _), stem) in enumerate(zip(frames, stems, strict=True)):
+        as_it_is |= {index: position, str(index): position}
+        if re.findall(r"0*(\d+)", stem)[-1:] == [str(index)]:  # it is a number, not a place among photographs
+            without_suffix[str(index)] = position
+    as_it_is |= by_stem | {name: position for position, (_, name) in enumerate(frames)}
+    without_suffix |= by_stem  # an export gives the images of a video, and those of EXR plates, a suffix of their own
+    found = dict[FrameKey, int]()
+    for key in keys:
+        if key in as_it_is:
+            found[key] = as_it_is[key]
+        elif isinstance(key, str) and _stem(key) in without_suffix:
+            found[key] = without_suffix[_stem(key)]
+    return found
+
+
+def _stem(name: str) -> str:
+    """A name without its suffix, which is not a number."""
+    suffix = PurePath(name).suffix
+    return name if suffix[1:].isdecimal() else name.removesuffix(suffix)
+
+
+def _check_different(keys: Iterable[FrameKey], found: Mapping[FrameKey, int]) -> None:
+    by_position: dict[int, FrameKey] = {}
+    for key in keys:
+        if by_position.setdefault(found[key], key) != key:
+            raise InputError(f"control: {by_position[found[key]]!r} and {key!r} are the same frame")
 
 
 def locate(

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from factorsfm.control.files import read_control
-from factorsfm.control.known import Control, find_frames
+from factorsfm.control.known import Control, KnownDistance, KnownPose, MarkedPoint, find_frames
 from factorsfm.export import ExportOptions, export
 from factorsfm.result.reconstruction import Reconstruction
 from factorsfm.support.errors import InputError
@@ -146,6 +146,80 @@ def test_frames_that_the_source_does_not_have_are_left_out(tmp_path: Path) -> No
     assert find_frames(control, [(k, f"{k:06d}") for k in range(5, 9)]) == {5: 0, 6: 1, 7: 2, 8: 3}
     with pytest.raises(InputError, match=r"none of the 30 poses, of frames 0 to 29, is of a frame of the source"):
         find_frames(control, [(k, f"{k:06d}") for k in range(100, 104)])
+
+
+@pytest.mark.parametrize(
+    ("kind", "frames"),
+    [
+        ("colmap", [(k, f"{k:06d}") for k in range(8, 22)]),  # a video: its images are 000010.png and so on
+        ("nerfstudio", [(k, f"{k:06d}") for k in range(8, 22)]),
+        ("colmap", [(k, f"plate.{k:06d}.exr") for k in range(8, 22)]),
+        ("nerfstudio", [(k, f"plate.{k:06d}.exr") for k in range(8, 22)]),  # its images are plate.000010.png
+    ],
+)
+def test_exports_name_the_frames_of_videos_and_plates(tmp_path: Path, kind: str, frames: list[tuple[int, str]]) -> None:
+    reconstruction = hard_reconstruction()
+    for frame in reconstruction.frames:
+        frame.name = dict(frames)[frame.index]
+    export(reconstruction, tmp_path / "out", format=kind)
+    found = find_frames(read_control(tmp_path / "out"), frames)
+    assert [*found.values()] == [frame - 8 for frame in FRAMES]
+
+
+@pytest.mark.parametrize(
+    ("key", "frames", "position"),
+    [
+        ("000012.png", [(11, "000011"), (12, "000012")], 1),
+        ("12.png", [(11, "000011"), (12, "000012")], 1),
+        ("0012.png", [(11, "000011"), (12, "000012")], None),  # perhaps the twelfth, which is 11
+        ("1012.png", [(1011, "a.1011.exr"), (1012, "a.1012.exr")], 1),
+        ("a.1012.png", [(1011, "a.1011.exr"), (1012, "a.1012.exr")], 1),
+        ("a.1012", [(1011, "a.1011"), (1012, "a.1012")], 1),
+        ("1.png", [(0, "bee.jpg"), (1, "cow.jpg")], None),  # a place among photographs is in no file name
+        ("7.png", [(0, "7.jpg"), (7, "0.jpg")], 0),
+        ("cow.png", [(0, "bee.jpg"), (1, "cow.jpg")], 1),
+        ("cow.png", [(0, "cow.tif"), (1, "cow.jpg")], None),
+        ("cow", [(0, "cow.tif"), (1, "cow.jpg")], None),
+        ("left/cow.png", [(0, "bee.jpg"), (1, "cow.jpg")], None),
+    ],
+)
+def test_names_with_another_suffix(key: str, frames: list[tuple[int, str]], position: int | None) -> None:
+    control = Control(distances=[KnownDistance(1.0, 0.1, frames=(key, "other"))])
+    frames = [*frames, (9999, "other")]
+    if position is None:
+        with pytest.raises(InputError, match=f"control: there is no frame '{key}' among the 3 frames"):
+            find_frames(control, frames)
+    else:
+        assert find_frames(control, frames)[key] == position
+
+
+def test_two_names_of_one_frame_are_refused() -> None:
+    message = r"control: '000002\.png' and 2 are the same frame"
+    frames = [(k, f"{k:06d}") for k in range(4)]
+    pair: list[str | int] = ["000002.png", 2]
+    with pytest.raises(InputError, match=message):
+        find_frames(Control(distances=[KnownDistance(1.0, 0.1, frames=pair)]), frames)
+    with pytest.raises(InputError, match=message):
+        find_frames(Control([KnownPose(key, [0, 0, k], 0.1, [0, 0, 0, 1], 1) for k, key in enumerate(pair)]), frames)
+    marks = MarkedPoint("A", {key: [1.0, 2.0] for key in pair})
+    with pytest.raises(InputError, match=message):
+        find_frames(Control(points=[marks], distances=[KnownDistance(1.0, 0.1, frames=(0, 1))]), frames)
+
+
+def test_images_can_be_counted_otherwise(tmp_path: Path) -> None:
+    reconstruction = hard_reconstruction()
+    for k, frame in enumerate(reconstruction.frames):
+        frame.name = f"img_{k + 1:04d}.png"
+    export(reconstruction, tmp_path / "model", format="colmap")
+    said = {"cameras": {"file": "model", "first_frame": 1}}
+    (tmp_path / "control.json").write_text(json.dumps(said))
+    for first_number, first in ((None, 0), (1001, 1001)):
+        poses = read_control(tmp_path / "control.json", first_number).poses
+        assert [pose.frame for pose in poses] == [first + k for k in (0, 1, 2, 4, 5)]
+    reconstruction.frames[0].name = "slate.png"
+    export(reconstruction, tmp_path / "model", format="colmap")
+    with pytest.raises(InputError, match=r"its images, slate.png to img_0006.png, differ in more than a number"):
+        read_control(tmp_path / "control.json")
 
 
 @pytest.mark.parametrize(
