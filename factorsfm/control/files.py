@@ -73,6 +73,7 @@ def read_control(path: str | Path, first_number: int | None = None) -> Control:
 def _tracked(cameras: _Cameras, first_number: int | None) -> list[KnownPose]:
     """The poses of a tracked camera, by name of their frames, or by index in the source."""
     tracked = read_tracked(Path(cameras.file), cameras.fps)
+    share = _PATH_SHARE if cameras.sigma is None else None
     sigma = _PATH_SHARE * tracked.extent if cameras.sigma is None else cameras.sigma
     if not tracked.numbered and cameras.first_frame is not None:
         tracked = _numbered(tracked)
@@ -81,7 +82,7 @@ def _tracked(cameras: _Cameras, first_number: int | None) -> list[KnownPose]:
     for key, pose in tracked.poses.items():
         cam_from_world = pycolmap.Rigid3d(pose[:3]).inverse()
         frame = key if isinstance(key, str) else key - shift
-        found.append(KnownPose.at(frame, cam_from_world, sigma, cameras.rotation_sigma))
+        found.append(replace(KnownPose.at(frame, cam_from_world, sigma, cameras.rotation_sigma), path_share=share))
     return found
 
 

@@ -25,6 +25,7 @@ Array = NDArray[np.float64]
 Vector = Sequence[float] | Array
 FrameKey = str | int
 
+STILL = 1e-9  # of a coordinate: a camera whose positions differ by less does not move
 _LARGEST = 1e12  # of a number, and of the inverse of one that is not 0: their squares and products stay finite
 
 
@@ -37,6 +38,7 @@ class KnownPose:
         position: (3,) centre of the camera; sigma: of each coordinate. 0 holds the whole pose exactly.
         cam_from_world: (4,) quaternion x, y, z, w of the rotation from the world to the camera, or None.
         rotation_sigma: of the rotation about each axis, degrees. 0 holds the whole pose exactly.
+        path_share: what `sigma` is of the path of all poses with a share, where it is not known; see `Control.within`.
 
     Raises:
         InputError: a value is missing or is none, or one of two sigmas is 0.
@@ -47,6 +49,7 @@ class KnownPose:
     sigma: float | None = None
     cam_from_world: Vector | None = None
     rotation_sigma: float | None = None
+    path_share: float | None = None
 
     def __post_init__(self) -> None:
         _check_frame(self.frame)
@@ -58,6 +61,7 @@ class KnownPose:
             raise InputError(f'"cam_from_world" is {list(self.cam_from_world)}; a unit quaternion is expected')
         _check_sigma("sigma", self.sigma, self.position is not None, zero=True)
         _check_sigma("rotation_sigma", self.rotation_sigma, self.cam_from_world is not None, zero=True)
+        _check_sigma("path_share", self.path_share, False)
         if 0.0 in (self.sigma, self.rotation_sigma) and self.sigma != self.rotation_sigma:
             raise InputError(
                 f'"sigma" is {self.sigma} and "rotation_sigma" {self.rotation_sigma}; '
@@ -213,18 +217,19 @@ class Control:
     def within(self, frames: Collection[FrameKey]) -> Control:
         """Without the poses of other frames than these, if they may be left out.
 
+        A sigma that is a share of the path is that of the path in these frames: what is left out may be of another
+        shot, far away.
+
         Raises:
-            InputError: none of the poses is of one of these frames.
+            InputError: none of the poses is of one of these frames, or those that are do not determine where it is.
         """
-        if not self.spare or not self.poses:
-            return self
-        poses = [pose for pose in self.poses if pose.frame in frames]
-        if not poses:
+        poses = [pose for pose in self.poses if pose.frame in frames] if self.spare else self.poses
+        if self.poses and not poses:
             raise InputError(
                 f"control: none of the {len(self.poses)} poses, of frames {self.poses[0].frame} to "
                 f"{self.poses[-1].frame}, is of a frame of the source; a control file can name the first_frame"
             )
-        return replace(self, poses=poses)
+        return replace(self, poses=_with_shares(poses))
 
     @property
     def frames(self) -> list[FrameKey]:
@@ -233,6 +238,15 @@ class Control:
         ends = [frame for distance in self.distances for frame in distance.frames]
         every = [*marked, *ends, *(height.frame for height in self.heights), *(pose.frame for pose in self.poses)]
         return list(dict.fromkeys(every))
+
+
+def _with_shares(poses: Sequence[KnownPose]) -> Sequence[KnownPose]:
+    """With the sigmas that are shares of the path of these poses, which is the diagonal of the box around them."""
+    path = np.array([pose.position for pose in poses if pose.path_share is not None], np.float64)
+    extent = float(np.linalg.norm(np.ptp(path, axis=0))) if len(path) else 0.0
+    if extent <= STILL * max(1.0, np.abs(path).max(initial=0.0)):  # it keeps what it was in a longer path
+        return poses
+    return [pose if pose.path_share is None else replace(pose, sigma=pose.path_share * extent) for pose in poses]
 
 
 class NamedFrame(Protocol):

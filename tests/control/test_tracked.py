@@ -141,6 +141,47 @@ def test_a_control_file_can_say_how_well_it_is_known(tmp_path: Path) -> None:
     assert len(control.distances) == 1
 
 
+def test_what_is_left_out_has_no_say_in_how_well_the_rest_is_known(tmp_path: Path) -> None:
+    path = chan(tmp_path / "a.chan", 1001, 30)
+    near = read_control(path)
+    far = "\n".join(f"{1101 + k} {1e4 * k} 5e3 0 0 0 0" for k in range(100))
+    path.write_text(path.read_text() + far)
+    control, frames = read_control(path), range(10, 20)
+    explicit = KnownPose(15, [1, 2, 3], 0.7)
+    mixed = Control([explicit, *(pose for pose in control.poses if pose.frame != 15)], spare=True).within(frames)
+    assert mixed.poses[0] == explicit
+    for poses, steps in (
+        (near.poses, 29),
+        (near.within(frames).poses, 9),
+        (control.within(frames).poses, 9),
+        (mixed.poses[1:], 9),
+    ):
+        np.testing.assert_allclose([pose.sigma for pose in poses], 0.01 * 0.5 * steps, rtol=1e-12)
+    with pytest.raises(InputError, match="a single position leaves the scale open; give a distance"):
+        near.within([15])
+
+
+def test_of_samples_while_the_shutter_is_open_the_whole_frame_counts(tmp_path: Path) -> None:
+    abc = pytest.importorskip("alembic3d.Abc", reason="alembic3d (extra alembic) is not installed")
+    from alembic3d.AbcCoreAbstract import TimeSampling
+    from alembic3d.AbcGeom import CameraSample, OCamera, OXform, XformSample
+    from imath import M44d
+
+    archive = abc.OArchive(str(tmp_path / "a.abc"))
+    sampling = archive.addTimeSampling(TimeSampling(0.25 / 24, 1001 / 24 - 0.25 / 24))
+    xform = OXform(archive.getTop(), "camera", sampling)
+    for k in range(-1, 14):  # frames 1001 to 1004, and quarters of one beside them
+        sample = XformSample()
+        sample.setMatrix(M44d(1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0.25 * k, 0, 0, 1))
+        xform.getSchema().set(sample)
+    OCamera(xform, "shape").getSchema().set(CameraSample())
+    del xform, archive
+    (tmp_path / "control.json").write_text(json.dumps({"cameras": {"file": "a.abc", "fps": 24}}))
+    poses = read_control(tmp_path / "control.json").poses
+    assert [pose.frame for pose in poses] == [0, 1, 2, 3]
+    np.testing.assert_allclose([pose.position for pose in poses], [[k, 0, 0] for k in range(4)], atol=1e-12)
+
+
 def test_frames_that_the_source_does_not_have_are_left_out(tmp_path: Path) -> None:
     control = read_control(chan(tmp_path / "a.chan", 1001, 30))
     assert find_frames(control, [(k, f"{k:06d}") for k in range(5, 9)]) == {5: 0, 6: 1, 7: 2, 8: 3}
@@ -229,8 +270,14 @@ def test_images_can_be_counted_otherwise(tmp_path: Path) -> None:
         ("a.chan", "1 2 3\n", 'the line "1 2 3" is not "frame tx ty tz rx ry rz"'),
         ("a.chan", "1 0 0 0 0 0 0\n2 0 0 0 0 0 0\n", "stands still"),
         ("a.chan", "1 0 0 0 0 0 0\n2 0 nan 0 0 0 0\n", "is not finite"),
+        ("a.chan", "1 0 0 0 0 0 0\n2 1 0 0 0 0 0\n1.0 2 0 0 0 0 0\n", 'frame "1" is there twice'),
         ("a.usda", "no stage", "it is no USD stage"),
         ("transforms.json", '{"frames": [{"file_path": "a", "transform_matrix": [[1]]}]}', "transform_matrix of a is"),
+        (
+            "transforms.json",
+            json.dumps({"frames": [{"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}] * 2}),
+            r'frame "a\.png" is there twice',
+        ),
         ("control.json", '{"cameras": {"sigma": 1}}', "cameras"),
         ("control.json", '{"cameras": {"file": "none.chan"}}', "there is no file"),
         ("control.json", '{"cameras": {"file": "none.fbx"}}', "there is no file"),
