@@ -31,6 +31,8 @@ _Curves = dict[str, dict[int, tuple[float, float]]]  # by name and number of the
 DEFAULT_SIGMA_PX = 0.5  # of a place that a person has set with care; automatic trackers are better
 _LARGEST = 1e6  # pixels and numbers of frames: beyond, a file holds something else
 _LONGEST_NAME = 100
+_COLUMNS = ("track", "frame", "x", "y")  # of a table
+_MOST_SHOWN = 100  # characters of a line
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,12 +166,21 @@ def _format_of(text: str, path: Path) -> tuple[str, Callable[[str], _Curves]]:
 def _of_table(text: str) -> _Curves:
     """A header with track, frame, x and y, and further columns that are not read."""
     reader = csv.DictReader(io.StringIO(text))
-    columns = reader.fieldnames or []
-    if missing := [name for name in ("track", "frame", "x", "y") if name not in columns]:
-        raise ValueError(f"the table has no column {missing[0]}; it has {', '.join(columns)}")
     found: _Curves = defaultdict(dict)
-    for row in reader:
-        _add(found[row["track"] or ""], row["track"], row["frame"], row["x"], row["y"], f"line {reader.line_num}")
+    whole = 0  # lines of whole rows
+    try:
+        columns = reader.fieldnames or []
+        if missing := [name for name in _COLUMNS if name not in columns]:
+            raise ValueError(f"the table has no column {missing[0]}; it has {', '.join(columns)[:_MOST_SHOWN]}")
+        whole = reader.line_num
+        for row in reader:
+            track, number, x, y = (row[name] for name in _COLUMNS)
+            if "\n" in f"{track}{number}{x}{y}":
+                raise csv.Error
+            _add(found[track or ""], track, number, x, y, f"line {reader.line_num}")
+            whole = reader.line_num
+    except csv.Error:
+        raise ValueError(f"after line {whole} a row does not end, as where a quote is not closed") from None
     return found
 
 

@@ -118,6 +118,15 @@ def test_a_script_of_nuke(tmp_path: Path) -> None:
         ("hello world\n", "neither a table"),
         ("name,frame,x,y\na,1,2,3\n", "no column track"),
         ("track,frame,x,y\n", "there is no track"),
+        (
+            'track,frame,x,y\na,0,1,2\n"a,1,1,2\na,2,1,2\n',
+            "after line 2 a row does not end, as where a quote is",
+        ),
+        (
+            'track,frame,x,y\na,0,1,2\n"a,1,1,2\n' + 20000 * "a,2,1,2\n",
+            "after line 2 a row does not end, as where a quote",
+        ),
+        ('"track,frame,x,y\n' + 20000 * "a,2,1,2\n", "after line 0 a row does not end, as where a quote is not closed"),
         ("track,frame,x,y\na,1,2\n", "line 2 is '1', '2', None"),
         ("track,frame,x,y\na,1.5,2,3\n", "line 2 is '1.5'"),
         ("track,frame,x,y\na,1,2,nan\n", "is none"),
