@@ -39,7 +39,8 @@ def solve_again(
 
     Args:
         result: that of a video; its folder, or a `Reconstruction`.
-        without_tracks: tracks that are left out: numbers as in COLMAP's model and in names of tracks, or names.
+        without_tracks: tracks that are left out: numbers as in COLMAP's model and in names of tracks, or names, which
+            come before numbers in texts.
         mask_regions: in which nothing counts, or their texts, see `MaskRegion.parse`.
         frames: the others are left out; numbers as in the result.
         control: what is known beforehand, or its JSON file; None is that of the result, if it had some.

@@ -313,6 +313,46 @@ def test_the_report_finds_the_wrong_ones_and_its_command_leaves_them_out(solved:
     assert read_result(f"{solved}-mended").notes == ["Solved again without 2 tracks: slides, slips."]
 
 
+@pytest.fixture(scope="module")
+def numbered(result: Reconstruction, tracks: UserTracks) -> tuple[Reconstruction, int]:
+    """Solved with a track that the user calls by the number of another one, and that number."""
+    number = int(result.track_ids[0]) + 1
+    own = UserTrack(str(number), tracks.tracks[0].frames, tracks.tracks[0].xy)
+    return solve_again(result, tracks=UserTracks([own], sigma=0.3)), number
+
+
+def test_a_name_comes_before_a_number(numbered: tuple[Reconstruction, int]) -> None:
+    solved, number = numbered
+    own, other = str(number), f"track_{number:05d}"
+    assert {own, other} < {*solved.track_names()}
+    for given, gone, stays in ((own, own, other), (other, other, own), (number, other, own)):
+        again = solve_again(solved, without_tracks=[given])
+        assert gone not in again.track_names()
+        assert stays in again.track_names()
+        assert again.notes[-1] == f"Solved again without 1 track: {gone}."
+        assert again.options["solved_again"][-1]["without_tracks"] == [str(given)]
+
+
+@pytest.mark.skipif(EXECUTABLE is None, reason=MISSING)
+@pytest.mark.parametrize("own", [True, False])
+def test_the_command_of_the_report_tells_a_number_from_a_name(
+    own: bool, numbered: tuple[Reconstruction, int], tmp_path: Path
+) -> None:
+    solved, number = numbered
+    row = solved.track_ids.tolist().index(number - 1)
+    solved.observation_error = np.where(solved.observation_point == row, 50.0, solved.observation_error)  # is listed
+    solved.write(tmp_path / "result")
+    browser = Chromium(tmp_path / "profile")
+    browser.open(tmp_path / "result" / "report.html")
+    name = str(number) if own else f"track_{number:05d}"
+    listed = f"[...byId('tracks_rows').rows].find(row => row.cells[1].textContent === '{name}')"
+    browser.run(f"{listed}.querySelector('input').click()")
+    command = shlex.split(browser.run("byId('mend_command').value"))
+    browser.close()
+    assert main(command[1:]) == 0
+    assert read_result(f"{tmp_path / 'result'}-mended").notes[-1] == f"Solved again without 1 track: {name}."
+
+
 def test_a_track_that_cannot_be_placed_is_named(result: Reconstruction, tracks: UserTracks) -> None:
     first, second = tracks.tracks[:2]
     once = UserTrack("window 9", np.array([0, 90, 91]), np.array([[5.0, 5.0]] * 3))
