@@ -74,6 +74,7 @@ class UserTracks:
         on: the plate on which they lie: the "footage" with its distortion, or the footage "undistorted".
         from_bottom: whether their y counts upwards, from the bottom edge of the image (not from a pixel's centre).
         source: where they come from, for people.
+        size: width and height of the image that they were placed in, pixels, if that is known.
 
     Raises:
         InputError: there is no track, two have the same name, or the standard deviation is none.
@@ -84,6 +85,7 @@ class UserTracks:
     on: Plate = "footage"
     from_bottom: bool = False
     source: str = "the tracks"
+    size: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
         if not self.tracks:
@@ -142,7 +144,8 @@ def read_tracks(
     except (ValueError, LookupError, OverflowError, RecursionError, InputError) as error:
         raise InputError(f"tracks {path}: {error}") from error
     plate: Plate = on or ("undistorted" if format == "tracks-nuke" else "footage")
-    return UserTracks(tracks, sigma, plate, not from_top, f"tracks {path}")
+    size = _size_in_after_effects(text) if format == "tracks-after-effects" else None
+    return UserTracks(tracks, sigma, plate, not from_top, f"tracks {path}", size)
 
 
 def _format_of(text: str, path: Path) -> tuple[str, Callable[[str], _Curves]]:
@@ -240,6 +243,12 @@ def _of_after_effects(text: str) -> _Curves:
             number, x, y = (*words, "", "")[:3]
             _add(places, name, number, x, y, f"line {k}")
     return found
+
+
+def _size_in_after_effects(text: str) -> tuple[int, int] | None:
+    """Width and height of the footage with trackers; that of a layer with positions is of the layer alone."""
+    said = re.findall(r"^\tSource (?:Width|Height)\t(\d+)\s*$", text, re.MULTILINE)
+    return (int(said[0]), int(said[1])) if len(said) == 2 and "\tFeature Center" in text else None
 
 
 def _count(text: str, what: str) -> int:

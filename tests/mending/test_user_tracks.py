@@ -86,6 +86,17 @@ def test_keyframes_that_after_effects_copies(tmp_path: Path) -> None:
     assert not read_tracks(tmp_path / "ae.txt").from_bottom
 
 
+@pytest.mark.parametrize(("sizes", "expected"), [("\tSource Height\t1080\r\n", (1920, 1080)), ("", None)])
+def test_after_effects_says_the_size_of_the_footage_but_not_of_a_composition(
+    sizes: str, expected: tuple[int, int] | None, tmp_path: Path
+) -> None:
+    said = AFTER_EFFECTS.replace("\t1920\r\n", f"\t1920\r\n{sizes}")
+    (tmp_path / "ae.txt").write_bytes(said.encode())
+    assert read_tracks(tmp_path / "ae.txt").size == expected
+    (tmp_path / "ae.txt").write_bytes(said.replace("Feature Center", "Confidence").encode())
+    assert read_tracks(tmp_path / "ae.txt").size is None  # that of the layer whose position it is
+
+
 NUKE = """
 Read { name Read1 }
 Tracker4 {
@@ -368,6 +379,35 @@ def test_a_track_that_cannot_be_placed_is_named(result: Reconstruction, tracks: 
     ]
     with pytest.raises(InputError, match="no track has two frames of the shot; its frames are 0 to 7"):
         solve_again(result, tracks=UserTracks([once, never]))
+
+
+def test_tracks_of_another_size_are_refused(result: Reconstruction, tracks: UserTracks, tmp_path: Path) -> None:
+    moving = tracks.tracks[0]
+    scaled = [UserTrack(track.name, track.frames, 2.0 * track.xy + 0.5) for track in tracks.tracks]
+    beyond = np.array([np.maximum(-0.5 - t.xy, t.xy - [319.5, 179.5]).max(axis=1) for t in scaled])
+    outside = int((beyond > 5.0).sum())
+    assert outside > 20
+    message = (
+        f"the tracks: {outside} of 64 places are outside of the footage of 320x180 pixels, by up to {beyond.max():.0f};"
+    )
+    with pytest.raises(InputError, match=message):
+        solve_again(result, tracks=UserTracks(scaled))
+    said = UserTracks([moving], size=(640, 360))
+    with pytest.raises(InputError, match="they are of an image of 640x360 pixels, the footage has 320x180"):
+        solve_again(result, tracks=said)
+    assert moving.name in solve_again(result, tracks=UserTracks([moving], size=(320, 180))).track_names()
+
+
+@pytest.mark.parametrize(("beyond", "leaving", "refused"), [(4.9, 8, False), (5.1, 2, False), (5.1, 3, True)])
+def test_tracks_may_leave_the_picture(beyond: float, leaving: int, refused: bool, result: Reconstruction) -> None:
+    xy = np.tile([100.0, 90.0], (FRAMES, 1))
+    xy[:leaving] = [319.5 + beyond, 90.0]
+    leaves = UserTracks([UserTrack("leaves", np.arange(FRAMES), xy)])
+    if refused:
+        with pytest.raises(InputError, match="3 of 8 places are outside of the footage of 320x180 pixels, by up to 5"):
+            solve_again(result, tracks=leaves)
+    else:
+        solve_again(result, tracks=leaves)
 
 
 def test_reconstruct_takes_them(tracks: UserTracks, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
