@@ -410,6 +410,16 @@ def test_tracks_may_leave_the_picture(beyond: float, leaving: int, refused: bool
         solve_again(result, tracks=leaves)
 
 
+@pytest.mark.parametrize("said", [["--tracks-sigma", "0.3"], ["--tracks-on", "footage"], ["--tracks-first-frame", "0"]])
+def test_what_is_said_of_tracks_needs_them(
+    said: list[str], solved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for command in (["solve", str(solved)], ["reconstruct", str(tmp_path)]):
+        assert main([*command, *said, "--output", str(tmp_path / "out")]) == 2
+        assert_error(capsys.readouterr(), f"{said[0]} needs --tracks FILE")
+    assert not (tmp_path / "out").exists()
+
+
 def test_reconstruct_takes_them(tracks: UserTracks, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shot = rendered("dolly")
     undistorted = UserTracks(tracks.tracks, sigma=0.3, on="undistorted")
