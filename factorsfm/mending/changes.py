@@ -103,12 +103,14 @@ class Changes:
             first_number: as in `read_control`.
 
         Raises:
-            InputError: a region, the range or the control cannot be used.
+            InputError: a track, a region, the range or the control cannot be used.
         """
+        tracks = _listed("without_tracks", without_tracks, int | str | np.integer, "numbers and names of tracks")
+        regions = _listed("mask_regions", mask_regions, MaskRegion | str, "regions")
         read = read_control(control, first_number) if isinstance(control, str | Path) else control
         return cls(
-            tuple(without_tracks),
-            tuple(r if isinstance(r, MaskRegion) else MaskRegion.parse(r) for r in mask_regions),
+            tracks,
+            tuple(r if isinstance(r, MaskRegion) else MaskRegion.parse(r) for r in regions),
             None if frames is None else checked_range(frames),
             read,
             str(control) if isinstance(control, str | Path) else None,
@@ -152,6 +154,15 @@ class Changes:
         if self.regions:
             notes.append(f"Solved again without what is seen in {' and '.join(map(str, self.regions))}.")
         return notes
+
+
+def _listed(name: str, given: Any, kinds: Any, expected: str) -> tuple[Any, ...]:
+    """What is in an argument that is a list; a text is no list of its letters."""
+    listed = isinstance(given, Iterable) and not isinstance(given, str)
+    items = tuple(given) if listed else ()
+    if not listed or not all(isinstance(item, kinds) and not isinstance(item, bool) for item in items):
+        raise InputError(f"{name} is {given!r:.80}; a list of {expected} is expected")
+    return items
 
 
 def _without_tracks(measured: MeasuredShot, names: Sequence[int | str]) -> MeasuredShot:

@@ -41,8 +41,8 @@ class UserTrack:
 
     Attributes:
         name: as the user calls it.
-        frames: (k,) numbers of the frames as in a result, ascending.
-        xy: (k, 2) pixels with centres at integers; see `UserTracks`.
+        frames: (k,) numbers of the frames as in a result, ascending; a list does.
+        xy: (k, 2) pixels with centres at integers; see `UserTracks`. A list does.
 
     Raises:
         InputError: there is no place, a frame is there twice, or a value is none.
@@ -53,15 +53,24 @@ class UserTrack:
     xy: Array
 
     def __post_init__(self) -> None:
-        frames, xy = np.asarray(self.frames), np.asarray(self.xy, np.float64)
+        if not isinstance(self.name, str) or not _is_name(self.name):
+            raise InputError(f"a track is called {self.name!r:.{_LONGEST_NAME}}; a name in one line is expected")
+        try:
+            frames, xy = np.asarray(self.frames, np.float64), np.asarray(self.xy, np.float64)
+        except (TypeError, ValueError) as error:
+            raise InputError(f'track "{self.name}" has frames or places that are no numbers') from error
         if frames.ndim != 1 or xy.shape != (len(frames), 2) or not len(frames):
             raise InputError(f'track "{self.name}" has frames of shape {frames.shape} and places of shape {xy.shape}')
         if (np.diff(frames) <= 0).any():
             raise InputError(f'the frames of track "{self.name}" do not ascend')
-        if not (np.abs(xy) < _LARGEST).all() or (np.abs(frames) > _LARGEST).any():
+        if not (np.abs(xy) < _LARGEST).all() or not (np.abs(frames) <= _LARGEST).all() or (frames % 1.0).any():
             raise InputError(f'track "{self.name}" has a place or a frame that is none')
-        if not self.name.strip() or len(self.name) > _LONGEST_NAME or not self.name.isprintable():
-            raise InputError(f"a track is called {self.name[:_LONGEST_NAME]!r}; a name in one line is expected")
+        object.__setattr__(self, "frames", frames.astype(np.int64))
+        object.__setattr__(self, "xy", xy)
+
+
+def _is_name(text: str) -> bool:
+    return bool(text.strip()) and len(text) <= _LONGEST_NAME and text.isprintable()
 
 
 @dataclass(frozen=True, slots=True)

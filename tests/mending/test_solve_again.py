@@ -156,6 +156,11 @@ def test_control_is_kept_until_there_is_another(result: Reconstruction, tmp_path
     [
         ({"without_tracks": [999999]}, "no track 999999 among the"),
         ({"without_tracks": ["door"]}, "no track door"),
+        ({"without_tracks": "12"}, "without_tracks is '12'; a list of numbers and names of tracks is expected"),
+        ({"without_tracks": 12}, "without_tracks is 12; a list of"),
+        ({"without_tracks": [1.5]}, r"without_tracks is \[1.5\]; a list of"),
+        ({"mask_regions": "0,0,9,9"}, "mask_regions is '0,0,9,9'; a list of regions is expected"),
+        ({"mask_regions": MaskRegion(0, 0, 9, 9)}, "a list of regions is expected"),
         ({"mask_regions": ["0,0,10"]}, '"0,0,10" is no region'),
         ({"mask_regions": ["0,0,10,0"]}, "is empty"),
         ({"mask_regions": ["5:3:0,0,9,9"]}, "empty"),

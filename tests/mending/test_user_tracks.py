@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 import re
 import shlex
 from collections.abc import Sequence
@@ -173,6 +174,11 @@ def test_files_that_cannot_be_read(text: str, words: str, tmp_path: Path) -> Non
         (lambda: UserTracks([a_track()], on="plate"), 'lie on "plate"'),
         (lambda: a_track(frames=[2, 1]), "do not ascend"),
         (lambda: a_track(frames=[1]), "of shape"),
+        (lambda: a_track(frames=[1, 2.5]), 'track "a" has a place or a frame that is none'),
+        (lambda: a_track(frames=[1, math.nan]), 'track "a" has a place or a frame that is none'),
+        (lambda: a_track(frames=["one", "two"]), 'track "a" has frames or places that are no numbers'),
+        (lambda: UserTrack("a", [0, 1], [[1.0, 2.0], [3.0]]), 'track "a" has frames or places that are no numbers'),
+        (lambda: UserTrack(7, [0], [[1.0, 2.0]]), "a track is called 7; a name in one line is expected"),
     ],
 )
 def test_tracks_that_are_none(tracks: Any, words: str) -> None:
@@ -180,7 +186,20 @@ def test_tracks_that_are_none(tracks: Any, words: str) -> None:
         tracks()
 
 
-def a_track(frames: Sequence[int] = (0, 1)) -> UserTrack:
+def test_lists_do_for_a_track() -> None:
+    track, same = UserTrack("a", [0, 1], [[10, 20], [11, 21]]), a_track()
+    for given, expected in ((track.frames, same.frames), (track.xy, same.xy)):
+        assert given.dtype == expected.dtype
+        np.testing.assert_array_equal(given, expected)
+
+
+def test_a_file_has_no_half_frames(tmp_path: Path) -> None:
+    (tmp_path / "tracks.csv").write_text("track,frame,x,y\na,1,2,3\n")
+    with pytest.raises(InputError, match=r"first_frame is 10\.5; a whole number is expected"):
+        read_tracks(tmp_path / "tracks.csv", first_frame=10.5)
+
+
+def a_track(frames: Sequence[Any] = (0, 1)) -> UserTrack:
     return UserTrack("a", np.array(frames), np.array([[10.0, 20.0], [11.0, 21.0]]))
 
 
