@@ -1,5 +1,6 @@
 """A result solved again from its tracks: the same without changes, and without what is left out."""
 
+import json
 import zipfile
 from collections.abc import Iterator
 from dataclasses import replace
@@ -17,6 +18,7 @@ from factorsfm import (
     MaskRegion,
     Options,
     Reconstruction,
+    ReconstructionError,
     Stream,
     solve_again,
 )
@@ -227,3 +229,20 @@ def test_the_command(result: Reconstruction, folder: Path, tmp_path: Path, capsy
     assert main(["solve", str(tmp_path / "mended"), "--output", str(tmp_path / "further")]) == 2
     assert_error(capsys.readouterr(), "keeps no tracks to solve again")
     assert not (tmp_path / "further").exists()
+
+
+def test_a_failure_says_why(result: Reconstruction, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    result.frames[0].thumbnail = thumbnail(np.full((90, 160, 3), 77, np.uint8))
+    result.write(tmp_path / "result")
+    command = ["solve", str(tmp_path / "result"), "--frames", "0:1", "--output", str(tmp_path / "failed")]
+    assert main(command) == 3
+    assert_error(capsys.readouterr(), "1 of 1 frames registered, at least 2 needed")
+    assert {path.name for path in (tmp_path / "failed").iterdir()} == {"summary.json", "report.html"}
+    summary = json.loads((tmp_path / "failed" / "summary.json").read_text())
+    assert "1 of 1 frames registered, at least 2 needed" in summary["reason"]
+    assert [status["index"] for status in summary["statuses"]] == [0]
+    assert summary["options"]["frames"] == "0:1"
+    assert (tmp_path / "failed" / "report.html").read_text().count("/9j/") == 1
+    with pytest.raises(ReconstructionError) as caught:
+        solve_again(result, frames=slice(3, 5))  # of which one repeats the other
+    assert [(frame.index, frame.repeats) for frame in caught.value.frames] == [(3, None), (4, 3)]
