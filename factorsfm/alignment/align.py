@@ -10,7 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorsfm.alignment.ground import Ground, level_ground
-from factorsfm.alignment.picks import Pick, PickedPoint, length_between, picked_point, plane_normal, ray
+from factorsfm.alignment.picks import (
+    Pick,
+    PickedPoint,
+    check_direction,
+    length_between,
+    picked_point,
+    plane_normal,
+    ray,
+)
 from factorsfm.alignment.planes import TOLERANCE
 from factorsfm.alignment.up import Up, camera_up, find_up
 from factorsfm.export.options import ExportOptions
@@ -22,6 +30,8 @@ from factorsfm.support.errors import InputError
 from factorsfm.support.similarity import Similarity
 
 Array = NDArray[np.float64]
+
+_LONGEST = 1e9  # metres of a length: beyond, no format of an export holds the scene, nor below the inverse
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +76,9 @@ def align(
     Raises:
         InputError: a pick or a length cannot be used, or the result is in the world of its control.
     """
-    picks = {name: _pick(pick) for name, pick in (("origin", origin), ("axis", axis), ("plane", plane)) if pick}
+    picks = {
+        name: _pick(pick) for name, pick in (("origin", origin), ("axis", axis), ("plane", plane)) if pick is not None
+    }
     _check(reconstruction, picks, distance, camera_height)
     aligning = _Aligning(reconstruction, picks, footage)
     world = aligning.world()
@@ -104,10 +116,14 @@ def _check(
         raise InputError("an axis needs an origin, and a plane needs origin and axis; they are picked together")
     lengths = {"distance": None if distance is None else distance.metres, "camera height": camera_height}
     for name, length in lengths.items():
-        if length is not None and not (np.isfinite(length) and length > 0):
-            raise InputError(f"the {name} is {length:g}; a positive number of metres is expected")
-    if distance is not None and not (np.isfinite(distance.sigma) and distance.sigma >= 0):
-        raise InputError(f"the standard deviation of the distance is {distance.sigma:g}; 0 or more is expected")
+        if length is not None and not 1.0 / _LONGEST <= length <= _LONGEST:
+            raise InputError(
+                f"the {name} is {length:g}; a number of metres from {1.0 / _LONGEST:g} to {_LONGEST:g} is expected"
+            )
+    if distance is not None and not 0.0 <= distance.sigma <= _LONGEST:
+        raise InputError(
+            f"the standard deviation of the distance is {distance.sigma:g}; 0 to {_LONGEST:g} metres are expected"
+        )
 
 
 class _Aligning:
@@ -158,8 +174,9 @@ class _Aligning:
         return find_up(self._result, None)
 
     def _picked_up(self) -> Up:
-        points = [picked_point(self._result, self._picks[name]) for name in ("origin", "axis", "plane")]
-        normal, std = plane_normal(points)
+        picks = [self._picks[name] for name in ("origin", "axis", "plane")]
+        points = [picked_point(self._result, pick) for pick in picks]
+        normal, std = plane_normal(points, [ray(self._result, pick)[0] for pick in picks])
         up = Up(normal * np.sign(normal @ camera_up(self._result)), std, ["picks"])
         self._origin = points[0]
         height = float(points[0].position @ up.direction)
@@ -201,9 +218,11 @@ class _Aligning:
         right = ahead[0] if abs(ahead[0] @ up) < 0.9 else ahead[2]  # a camera on its side
         if "axis" in self._picks:
             assert self._origin is not None
-            right = self._on_ground(self._picks["axis"]).position - self._origin.position
+            point = self._on_ground(self._picks["axis"])
+            check_direction(self._result, self._picks["origin"], self._picks["axis"], point)
+            right = point.position - self._origin.position
         level = right - (right @ up) * up
-        if np.linalg.norm(level) < 0.05 * np.linalg.norm(right):
+        if np.linalg.norm(level) <= 0.05 * np.linalg.norm(right):
             raise InputError("the point of the axis lies above or below the origin; pick one beside it")
         level = level / np.linalg.norm(level)
         rotation = np.array([level, -up, np.cross(level, -up)])

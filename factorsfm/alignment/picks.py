@@ -21,6 +21,7 @@ _REACH = 0.08  # of the image's larger side, within which tracks say how far the
 _FEWEST = 3
 _CLICK_PX = 1.0  # standard deviation of a picked pixel
 _FEW = 1.5  # a spread seen in so few neighbours is too small as often: Student's t with their freedom
+_LEAST_PX = 3.0  # between pixels that tell a direction: twice what two clicks may be off
 _LEAST_NOISE_PX = 0.1  # of a track that keeps its error
 
 
@@ -205,18 +206,50 @@ def length_between(a: PickedPoint, b: PickedPoint) -> tuple[float, float]:
     return length, std
 
 
-def plane_normal(points: Sequence[PickedPoint]) -> tuple[Array, float]:
-    """(3,) unit normal of the plane through three points, and its standard deviation about the worst axis, degrees.
+def check_direction(result: Reconstruction, start: Pick, end: Pick, there: PickedPoint) -> None:
+    """Insist that a pixel tells a direction from another one.
+
+    Args:
+        there: the point at the `end`.
 
     Raises:
-        InputError: they are on a line.
+        InputError: in the picture of the `start` it is no further away than two clicks may be off.
+    """
+    frame = frame_of(result, start)
+    assert frame.cam_from_world is not None
+    seen = result.camera_of(frame).img_from_cam((frame.cam_from_world * there.position)[None])
+    apart = float(np.linalg.norm(np.asarray(seen)[0] - PIXEL_CENTER - [start.x, start.y]))
+    if apart <= _LEAST_PX:
+        raise InputError(f"{end} is {apart:.2g} pixels from {start}, which tells no direction; pick one further away")
+
+
+def plane_normal(points: Sequence[PickedPoint], eyes: Sequence[Array]) -> tuple[Array, float]:
+    """(3,) unit normal of the plane through three points, and its standard deviation about the worst axis, degrees.
+
+    Args:
+        eyes: (3,) centres of the cameras in whose pictures they are picked.
+
+    Raises:
+        InputError: they are on a line, or nearly, or their plane may pass through a camera.
     """
     a, b, c = (point.position for point in points)
     normal = np.cross(b - a, c - a)
-    longest = max(float(np.linalg.norm(side)) for side in (b - a, c - a, c - b))
-    breadth = float(np.linalg.norm(normal)) / max(longest, 1e-300)
+    longest = max((b - a, c - a, c - b), key=lambda side: float(np.linalg.norm(side)))
+    length = max(float(np.linalg.norm(longest)), 1e-300)
+    breadth = float(np.linalg.norm(normal)) / length
     normal = normal / max(float(np.linalg.norm(normal)), 1e-300)
-    off = float(np.sqrt(max(normal @ point.covariance @ normal for point in points)))
-    if breadth <= 2 * off:
+    off, aside = (
+        float(np.sqrt(max(along @ point.covariance @ along for point in points)))
+        for along in (normal, np.cross(normal, longest / length))
+    )
+    std = float(np.arctan2(1.5 * off, breadth))
+    if breadth <= 2 * max(off, aside):
         raise InputError("the three picked points are on a line, or nearly; pick a third one off the line")
-    return normal, float(np.degrees(np.arctan2(1.5 * off, breadth)))
+    for eye in eyes:  # pixels on a line are the edge of a plane through the camera, which is no ground
+        height, spread = abs(float((eye - a) @ normal)), float(np.hypot(off, std * np.linalg.norm(eye - a)))
+        if height <= 2 * spread:
+            raise InputError(
+                f"the camera is {height:.2g} above the plane of the three picked points, give or take {spread:.2g}, "
+                "which tells no ground; pick them further apart, and not on a line of the picture"
+            )
+    return normal, float(np.degrees(std))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,8 @@ from factorsfm.support.json_reading import parse_json
 
 Array = NDArray[np.float64]
 
-_MATRIX, _COEFFICIENTS = ("camera_matrix", "cameraMatrix", "K"), ("distortion_coefficients", "dist_coeffs", "D")
+_MATRIX = ("camera_matrix", "cameraMatrix", "K", "k")  # ROS 1 and 2 have K and k in their messages
+_COEFFICIENTS = ("distortion_coefficients", "dist_coeffs", "D", "d")
 _WIDTH, _HEIGHT = ("image_width", "width"), ("image_height", "height")
 _FISHEYE = ("fisheye", "equidistant")  # what ROS calls the model
 _SAMPLE = {"static", "lens"}  # keys of OpenTrackIO
@@ -87,7 +89,7 @@ def _colmap(path: Path) -> dict[str, Any]:
 def _opencv(path: Path) -> dict[str, Any]:
     text = _text(path)
     if path.suffix.lower() in _YAML and not text.startswith("%YAML"):
-        text = f"%YAML:1.0\n---\n{text.removeprefix('---')}"
+        text = f"%YAML:1.0\n---\n{_first_document(text)}"
     try:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
     except (cv2.error, SystemError) as error:
@@ -106,6 +108,13 @@ def _opencv(path: Path) -> dict[str, Any]:
     return {**size, "model": named, "params": [fx, fy, cx, cy, *extra]}
 
 
+def _first_document(text: str) -> str:
+    """The first document of a YAML file, of which OpenCV reads one alone; lists are indented, as it expects them."""
+    parts = re.split(r"^---[ \t]*$", text, flags=re.MULTILINE)
+    first = next((part for part in parts if re.search(r"^[^#\s]", part, re.MULTILINE)), "")
+    return re.sub(r"^( *)- ", r"\1  - ", first, flags=re.MULTILINE)
+
+
 def _perspective(extra: list[float]) -> tuple[str, list[float]]:
     """COLMAP's model and parameters of OpenCV's coefficients k1, k2, p1, p2, k3, k4, k5, k6, and further ones."""
     if len(extra) not in (0, 4, 5, 8, 12, 14) or any(extra[8:]):
@@ -116,13 +125,15 @@ def _perspective(extra: list[float]) -> tuple[str, list[float]]:
 
 
 def _arrays(storage: cv2.FileStorage, names: tuple[str, ...]) -> Iterator[Array]:
-    """The arrays under some names: OpenCV's matrices, or ROS's lists of numbers."""
+    """The arrays under some names: OpenCV's matrices and those of ROS's files, or the plain lists of its messages."""
     for name in names:
         node = storage.getNode(name)
-        if node.isMap():
-            values = node.getNode("data")
-            if values.isSeq():  # not node.mat(), which asserts that the sizes are right
-                yield np.array([values.at(k).real() for k in range(values.size())])
+        values = node.getNode("data") if node.isMap() else node
+        if values.isSeq():  # not node.mat(), which asserts that the sizes are right
+            items = [values.at(k) for k in range(values.size())]
+            if not all(item.isInt() or item.isReal() for item in items):
+                raise InputError(f"{name} holds something else than numbers; a plain list of them is expected")
+            yield np.array([item.real() for item in items])
 
 
 def _number(storage: cv2.FileStorage, names: tuple[str, ...]) -> float:

@@ -17,6 +17,7 @@ from factorsfm.priors.depth_map import DepthKind
 from factorsfm.report.result_folder import write_folder
 from factorsfm.result.reconstruction import Reconstruction
 from factorsfm.result.summary import conclusion
+from factorsfm.support.errors import InputError
 from factorsfm.support.options import PRESETS, LensFreedom, ShutterUse
 from factorsfm.support.progress import Progress
 
@@ -170,9 +171,8 @@ def add_tracks(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--tracks-sigma",
         type=float,
-        default=DEFAULT_SIGMA_PX,
         metavar="PIXELS",
-        help="standard deviation of their places (default: %(default)s)",
+        help=f"standard deviation of their places (default: {DEFAULT_SIGMA_PX})",
     )
     parser.add_argument(
         "--tracks-on",
@@ -191,15 +191,18 @@ def tracks_of(arguments: argparse.Namespace, first_number: int | None) -> UserTr
     """The tracks of the user; `first_number`: of a source that is a numbered sequence.
 
     Raises:
-        InputError: they cannot be read.
+        InputError: they cannot be read, or something is said of them and they are not given.
     """
     if arguments.tracks is None:
+        said = [name for name in ("sigma", "on", "first_frame") if getattr(arguments, f"tracks_{name}") is not None]
+        if said:
+            raise InputError(f"--tracks-{said[0].replace('_', '-')} needs --tracks FILE")
         return None
     return read_tracks(
         arguments.tracks,
         first_number=first_number,
         first_frame=arguments.tracks_first_frame,
-        sigma=arguments.tracks_sigma,
+        sigma=DEFAULT_SIGMA_PX if arguments.tracks_sigma is None else arguments.tracks_sigma,
         on=arguments.tracks_on,
     )
 

@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 import argparse
+import time
 from pathlib import Path
 
-from factorsfm.cli.command import Command, add_output, add_range, add_tracks, range_of, tracks_of, write_result
+from factorsfm.cli.command import (
+    Command,
+    add_output,
+    add_range,
+    add_tracks,
+    as_given,
+    range_of,
+    tracks_of,
+    write_result,
+)
 from factorsfm.cli.progress_line import ProgressLine
 from factorsfm.mending.solve_again import read_with_pictures, solve_again
-from factorsfm.report.result_folder import check_directory
-from factorsfm.support.errors import InputError
+from factorsfm.report.result_folder import check_directory, write_failure
+from factorsfm.support.errors import InputError, ReconstructionError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,20 +51,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
-    """Write the result that is solved again; see `Command.run`."""
+    """Write the result that is solved again, or the reason of the failure; see `Command.run`."""
     check_directory(arguments.output)
     if arguments.output.resolve() == arguments.result.resolve():
         raise InputError("the output folder is that of the result, which keeps what is left out; choose another one")
     known = read_with_pictures(arguments.result)
-    solved = solve_again(
-        known,
-        without_tracks=arguments.without_tracks,
-        mask_regions=arguments.mask_region,
-        frames=range_of(arguments),
-        control=arguments.control,
-        tracks=tracks_of(arguments, known.options.get("first_number")),
-        progress=progress,
-    )
+    tracks = tracks_of(arguments, known.options.get("first_number"))
+    begin = time.perf_counter()
+    try:
+        solved = solve_again(
+            known,
+            without_tracks=arguments.without_tracks,
+            mask_regions=arguments.mask_region,
+            frames=range_of(arguments),
+            control=arguments.control,
+            tracks=tracks,
+            progress=progress,
+        )
+    except ReconstructionError as error:
+        said, seconds = {"source": known.options.get("source")} | as_given(arguments), time.perf_counter() - begin
+        write_failure(arguments.output, str(error), error.frames, said, {"total": seconds})
+        raise
     return write_result(solved, arguments.output, progress)
 
 

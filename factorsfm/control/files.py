@@ -10,6 +10,7 @@ import pycolmap
 
 from factorsfm.control.known import Control, KnownDistance, KnownHeight, KnownPose, MarkedPoint
 from factorsfm.control.tracked import TrackedCamera, is_camera_file, read_tracked
+from factorsfm.frames.sequences import sequence_numbers
 from factorsfm.support.errors import InputError
 from factorsfm.support.json_reading import read_json, typed
 
@@ -27,7 +28,7 @@ class _Cameras:
     Attributes:
         file: beside the control file, or with its whole path.
         sigma: of each coordinate; None takes a share of the camera's path. rotation_sigma: degrees.
-        first_frame: number in the file of the source's first frame.
+        first_frame: number in the file of the source's first frame, in the names of images, too.
         fps: of an Alembic archive.
     """
 
@@ -72,14 +73,30 @@ def read_control(path: str | Path, first_number: int | None = None) -> Control:
 def _tracked(cameras: _Cameras, first_number: int | None) -> list[KnownPose]:
     """The poses of a tracked camera, by name of their frames, or by index in the source."""
     tracked = read_tracked(Path(cameras.file), cameras.fps)
+    share = _PATH_SHARE if cameras.sigma is None else None
     sigma = _PATH_SHARE * tracked.extent if cameras.sigma is None else cameras.sigma
+    if not tracked.numbered and cameras.first_frame is not None:
+        tracked = _numbered(tracked)
     shift = _shift(tracked, cameras.first_frame, first_number)
     found = []
     for key, pose in tracked.poses.items():
         cam_from_world = pycolmap.Rigid3d(pose[:3]).inverse()
         frame = key if isinstance(key, str) else key - shift
-        found.append(KnownPose.at(frame, cam_from_world, sigma, cameras.rotation_sigma))
+        found.append(replace(KnownPose.at(frame, cam_from_world, sigma, cameras.rotation_sigma), path_share=share))
     return found
+
+
+def _numbered(tracked: TrackedCamera) -> TrackedCamera:
+    """With the numbers in the names of its images for its frames.
+
+    Raises:
+        InputError: they differ in more than a number.
+    """
+    names = sorted(map(str, tracked.poses), key=lambda name: (len(name), name))
+    numbers = sequence_numbers(names)
+    if numbers is None:
+        raise InputError(f"its images, {names[0]} to {names[-1]}, differ in more than a number; first_frame needs that")
+    return TrackedCamera({n: tracked.poses[name] for n, name in zip(numbers, names, strict=True)}, numbered=True)
 
 
 def _shift(tracked: TrackedCamera, first_frame: int | None, first_number: int | None) -> int:

@@ -6,8 +6,9 @@ with its standard deviation (`sigma`). Frames are named by their name, with or w
 
 from __future__ import annotations
 
+import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import PurePath
 from typing import Any, Protocol
@@ -24,6 +25,7 @@ Array = NDArray[np.float64]
 Vector = Sequence[float] | Array
 FrameKey = str | int
 
+STILL = 1e-9  # of a coordinate: a camera whose positions differ by less does not move
 _LARGEST = 1e12  # of a number, and of the inverse of one that is not 0: their squares and products stay finite
 
 
@@ -36,6 +38,7 @@ class KnownPose:
         position: (3,) centre of the camera; sigma: of each coordinate. 0 holds the whole pose exactly.
         cam_from_world: (4,) quaternion x, y, z, w of the rotation from the world to the camera, or None.
         rotation_sigma: of the rotation about each axis, degrees. 0 holds the whole pose exactly.
+        path_share: what `sigma` is of the path of all poses with a share, where it is not known; see `Control.within`.
 
     Raises:
         InputError: a value is missing or is none, or one of two sigmas is 0.
@@ -46,6 +49,7 @@ class KnownPose:
     sigma: float | None = None
     cam_from_world: Vector | None = None
     rotation_sigma: float | None = None
+    path_share: float | None = None
 
     def __post_init__(self) -> None:
         _check_frame(self.frame)
@@ -57,6 +61,7 @@ class KnownPose:
             raise InputError(f'"cam_from_world" is {list(self.cam_from_world)}; a unit quaternion is expected')
         _check_sigma("sigma", self.sigma, self.position is not None, zero=True)
         _check_sigma("rotation_sigma", self.rotation_sigma, self.cam_from_world is not None, zero=True)
+        _check_sigma("path_share", self.path_share, False)
         if 0.0 in (self.sigma, self.rotation_sigma) and self.sigma != self.rotation_sigma:
             raise InputError(
                 f'"sigma" is {self.sigma} and "rotation_sigma" {self.rotation_sigma}; '
@@ -212,19 +217,20 @@ class Control:
     def within(self, frames: Collection[FrameKey]) -> Control:
         """Without the poses of other frames than these, if they may be left out.
 
+        A sigma that is a share of the path is that of the path in these frames: what is left out may be of another
+        shot, far away.
+
         Raises:
-            InputError: none of the poses is of one of these frames.
+            InputError: none of the poses is of one of these frames, or those that are do not determine where it is.
         """
-        if not self.spare or not self.poses:
-            return self
-        poses = [pose for pose in self.poses if pose.frame in frames]
-        if not poses:
+        poses = [pose for pose in self.poses if pose.frame in frames] if self.spare else self.poses
+        if self.poses and not poses:
             raise InputError(
                 f"control: none of the {len(self.poses)} poses, of frames {self.poses[0].frame} to "
                 f"{self.poses[-1].frame}, is of a frame of the source; a control file can name the first_frame, "
                 "and the fps of an Alembic archive"
             )
-        return replace(self, poses=poses)
+        return replace(self, poses=_with_shares(poses))
 
     @property
     def frames(self) -> list[FrameKey]:
@@ -233,6 +239,15 @@ class Control:
         ends = [frame for distance in self.distances for frame in distance.frames]
         every = [*marked, *ends, *(height.frame for height in self.heights), *(pose.frame for pose in self.poses)]
         return list(dict.fromkeys(every))
+
+
+def _with_shares(poses: Sequence[KnownPose]) -> Sequence[KnownPose]:
+    """With the sigmas that are shares of the path of these poses, which is the diagonal of the box around them."""
+    path = np.array([pose.position for pose in poses if pose.path_share is not None], np.float64)
+    extent = float(np.linalg.norm(np.ptp(path, axis=0))) if len(path) else 0.0
+    if extent <= STILL * max(1.0, np.abs(path).max(initial=0.0)):  # it keeps what it was in a longer path
+        return poses
+    return [pose if pose.path_share is None else replace(pose, sigma=pose.path_share * extent) for pose in poses]
 
 
 class NamedFrame(Protocol):
@@ -265,18 +280,51 @@ def find_frames(control: Control, frames: Sequence[tuple[int, str]]) -> dict[Fra
     """Position of each frame of the control among those with these indices and names.
 
     Raises:
-        InputError: a frame is not there that may not be left out.
+        InputError: a frame is not there that may not be left out, or is meant twice where different ones are expected.
     """
-    by_name: dict[FrameKey, int] = {}
-    for position, (index, _) in enumerate(frames):
-        by_name.update({index: position, str(index): position})
-    by_name.update({PurePath(name).stem: position for position, (_, name) in enumerate(frames)})
-    by_name.update({name: position for position, (_, name) in enumerate(frames)})
-    control = control.within(by_name.keys())
-    missing = [key for key in control.frames if key not in by_name]
+    found = _positions(control.frames, frames)
+    control = control.within(found.keys())
+    missing = [key for key in control.frames if key not in found]
     if missing:
         raise InputError(f"control: there is no frame {missing[0]!r} among the {len(frames)} frames")
-    return {key: by_name[key] for key in control.frames}
+    _check_different([pose.frame for pose in control.poses], found)
+    for keys in (*(point.pixels for point in control.points), *(distance.frames for distance in control.distances)):
+        _check_different(keys, found)
+    return {key: found[key] for key in control.frames}
+
+
+def _positions(keys: Iterable[FrameKey], frames: Sequence[tuple[int, str]]) -> dict[FrameKey, int]:
+    """Position of each key that is a frame's index or its name, without its suffix or with another one."""
+    stems = [_stem(PurePath(name).name) for _, name in frames]
+    counts = Counter(stems)  # of a.jpg and a.png nobody knows which one "a" is
+    by_stem: dict[FrameKey, int] = {stem: k for k, stem in enumerate(stems) if counts[stem] == 1}
+    as_it_is, without_suffix = dict[FrameKey, int](), dict[FrameKey, int]()
+    for position, ((index, _), stem) in enumerate(zip(frames, stems, strict=True)):
+        as_it_is |= {index: position, str(index): position}
+        if re.findall(r"0*(\d+)", stem)[-1:] == [str(index)]:  # it is a number, not a place among photographs
+            without_suffix[str(index)] = position
+    as_it_is |= by_stem | {name: position for position, (_, name) in enumerate(frames)}
+    without_suffix |= by_stem  # an export gives the images of a video, and those of EXR plates, a suffix of their own
+    found = dict[FrameKey, int]()
+    for key in keys:
+        if key in as_it_is:
+            found[key] = as_it_is[key]
+        elif isinstance(key, str) and _stem(key) in without_suffix:
+            found[key] = without_suffix[_stem(key)]
+    return found
+
+
+def _stem(name: str) -> str:
+    """A name without its suffix, which is not a number."""
+    suffix = PurePath(name).suffix
+    return name if suffix[1:].isdecimal() else name.removesuffix(suffix)
+
+
+def _check_different(keys: Iterable[FrameKey], found: Mapping[FrameKey, int]) -> None:
+    by_position: dict[int, FrameKey] = {}
+    for key in keys:
+        if by_position.setdefault(found[key], key) != key:
+            raise InputError(f"control: {by_position[found[key]]!r} and {key!r} are the same frame")
 
 
 def locate(

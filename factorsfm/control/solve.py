@@ -21,8 +21,7 @@ from factorsfm.control.fit import ControlFit, ControlResidual
 from factorsfm.control.known import LocatedControl
 from factorsfm.control.residuals import AlignedState, ControlTerm, Item
 from factorsfm.control.solved_control import SolvedControl
-from factorsfm.control.start import start_under_control
-from factorsfm.support.errors import ReconstructionError
+from factorsfm.control.start import KERNEL, check_size, start_under_control, wide_kernel
 from factorsfm.support.options import PolishOptions
 from factorsfm.support.similarity import Similarity
 
@@ -30,9 +29,7 @@ Array = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
 
-KERNEL = 3.0  # Cauchy scale of the control, standard deviations
 _STEPS, _TOLERANCE = 25, 2e-5
-_COLLAPSE = 10.0  # fall of the logarithm of the scale with which a scene vanishes
 _POINT_STEPS = 5  # of the points alone, after cameras were put where they are held
 _POINT_SIGMA = 5.0  # a weak prior of the points: the control may change the shape of the scene
 
@@ -86,12 +83,7 @@ def solve_under_control(
         )
         state = points_only.solve(_POINT_STEPS)
     solved = _converged(adjustment, state, term, held, options)
-    if solved.state.control[6] < begin - _COLLAPSE:
-        worst = max(_residuals(term, solved.state), key=lambda residual: residual.sigmas)
-        raise ReconstructionError(
-            "control: it contradicts the images so much that the scene shrinks to a point; "
-            f"{worst.name} is then off by {worst.sigmas:.0f} sigma"
-        )
+    check_size(term, solved.state, begin)
     residuals = _residuals(term, solved.state)
     logger.info("control: %d items, %d contradict", len(residuals), sum(r.contradicts for r in residuals))
     exact = [control.names[row] for row, _ in control.held]
@@ -123,11 +115,9 @@ def _converged(
     adjustment: BundleAdjustment, state: State, term: ControlTerm, held: NDArray[np.bool_], options: PolishOptions
 ) -> BundleAdjustment:
     """The joint adjustment at its minimum, first with a kernel as wide as the residuals are at the start."""
-    sizes = [float(np.linalg.norm(r)) for r in term.residuals(state)]
-    typical = float(np.median(sizes)) if sizes else 0.0
     solved = adjustment
     # At a start far away, a narrow kernel would take all control for outliers.
-    for kernel in sorted({max(KERNEL, 2.0 * typical), KERNEL}, reverse=True):
+    for kernel in sorted({wide_kernel(term, state), KERNEL}, reverse=True):
         term.kernel = kernel
         solved = BundleAdjustment(
             state, adjustment.observations, options, adjustment.errors,

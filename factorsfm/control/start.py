@@ -13,12 +13,14 @@ from factorsfm.control.known import KnownPose
 from factorsfm.control.residuals import ALIGNMENT, ControlTerm, Place
 from factorsfm.control.solved_control import SolvedControl, rotation_of
 from factorsfm.control.world_alignment import Correspondences, align_worlds
+from factorsfm.support.errors import ReconstructionError
 from factorsfm.support.semidefinite import solution
 from factorsfm.support.similarity import Similarity
 
 Array = NDArray[np.float64]
 
-_NO_KERNEL = 1e6  # Cauchy scale, standard deviations
+KERNEL = 3.0  # Cauchy scale of the control, standard deviations
+_COLLAPSE = 10.0  # fall of the logarithm of the scale with which a scene vanishes
 _STEPS = 30
 _EXACT = 1e-5  # of the extent of the known positions: sigma of exact poses
 _EXACT_DEG = 1e-3
@@ -28,7 +30,8 @@ def start_under_control(control: SolvedControl, state: State) -> tuple[State, Co
     """The state with world alignment and marked points, the control as a term on it, and (k,) which frames are held.
 
     Raises:
-        ReconstructionError: the control does not determine scale, rotation or place of its world.
+        ReconstructionError: the control does not determine scale, rotation or place of its world, or contradicts the
+            images so much that the scene vanishes.
     """
     alignment = align_worlds(_correspondences(control, state), control.placed)
     held = np.zeros(len(state.rotation), bool)
@@ -43,8 +46,38 @@ def start_under_control(control: SolvedControl, state: State) -> tuple[State, Co
     variables = np.concatenate(
         [np.zeros(3), alignment.points(anchor[None])[0], [np.log(alignment.scale)], places.ravel()]
     )
-    term = ControlTerm(control.items(), alignment.rotation, anchor, free, _NO_KERNEL)
-    return _with_best_alignment(replace(state, control=variables), term), term, held
+    term = ControlTerm(control.items(), alignment.rotation, anchor, free, KERNEL)
+    state = replace(state, control=variables)
+    # No narrower than the residuals: it would take all control for outliers, and no wider: one wild pose would drag it.
+    term.kernel = wide_kernel(term, state)
+    state = _with_best_alignment(state, term)
+    check_size(term, state, float(variables[6]))
+    return state, term, held
+
+
+def wide_kernel(term: ControlTerm, state: State) -> float:
+    """Cauchy scale, standard deviations, that is as wide as most of the residuals."""
+    sizes = [float(np.linalg.norm(r)) for r in term.residuals(state)]
+    return max(KERNEL, 2.0 * float(np.median(sizes))) if sizes else KERNEL
+
+
+def check_size(term: ControlTerm, state: State, begin: float) -> None:
+    """Insist that the scene has not vanished.
+
+    Args:
+        begin: logarithm of its scale before.
+
+    Raises:
+        ReconstructionError: it has; names the control that is off most.
+    """
+    if state.control[6] >= begin - _COLLAPSE:
+        return
+    sizes = [float(np.linalg.norm(r)) for r in term.residuals(state)]
+    worst = int(np.argmax(sizes))
+    raise ReconstructionError(
+        "control: it contradicts the images so much that the scene shrinks to a point; "
+        f"{term.items[worst].name} is then off by {sizes[worst]:.0f} sigma"
+    )
 
 
 def _correspondences(control: SolvedControl, state: State) -> Correspondences:

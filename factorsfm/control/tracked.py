@@ -6,6 +6,7 @@ result are in the world of the file.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path, PurePath
@@ -16,6 +17,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from factorsfm.control.known import STILL
 from factorsfm.support.errors import InputError
 from factorsfm.support.extras import require
 from factorsfm.support.json_reading import read_json, typed
@@ -26,7 +28,6 @@ Poses = dict[str | int, Array]  # (4, 4) camera to world in OpenCV's axes, by na
 
 _COLMAP = ("images.bin", "images.txt")
 _LARGEST = 1e12  # of a number: its square stays finite
-_STILL = 1e-9  # of a number: a camera whose positions differ by less does not move
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,9 +85,16 @@ def read_tracked(path: Path, fps: float | None = None) -> TrackedCamera:
     values = np.array(list(tracked.poses.values()))
     if not (np.abs(values) <= _LARGEST).all():
         raise InputError(f"a pose in it is not finite, or beyond {_LARGEST:g}")
-    if tracked.extent <= _STILL * max(1.0, np.abs(values[:, :3, 3]).max()):
+    if tracked.extent <= STILL * max(1.0, np.abs(values[:, :3, 3]).max()):
         raise InputError("its camera stands still, which gives a scene no size; positions that differ are expected")
     return tracked
+
+
+def _add(poses: Poses, frame: str | int, pose: Array) -> None:
+    """Put the pose of another frame to the others: of two, nobody knows which is right."""
+    if frame in poses:
+        raise InputError(f'frame "{frame}" is there twice')
+    poses[frame] = pose
 
 
 def _opencv(world_from_film: Array, up: UpAxis, scale: float = 1.0) -> Array:
@@ -122,7 +130,7 @@ def _chan(path: Path) -> Poses:
         x, y, z = (cv2.Rodrigues(np.radians(a) * axis)[0] for a, axis in zip(place[3:], np.eye(3), strict=True))
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = y @ x @ z, place[:3]
-        found[round(number)] = _opencv(matrix, UpAxis.Y)
+        _add(found, round(number), _opencv(matrix, UpAxis.Y))
     return found
 
 
@@ -138,7 +146,7 @@ def _colmap(folder: Path) -> Poses:
     found: Poses = {}
     for _, image in sorted(model.images.items()):
         if image.has_pose:
-            found[image.name] = np.vstack([image.cam_from_world().inverse().matrix(), [0.0, 0.0, 0.0, 1.0]])
+            _add(found, image.name, np.vstack([image.cam_from_world().inverse().matrix(), [0.0, 0.0, 0.0, 1.0]]))
     return found
 
 
@@ -161,7 +169,7 @@ def _nerfstudio(path: Path) -> Poses:
             raise InputError(f"the transform_matrix of {frame.file_path} is not 4x4")
         parts = PurePath(frame.file_path).parts
         name = "/".join(parts[1:] if len(parts) > 1 and parts[0].startswith("images") else parts)
-        found[name] = _opencv(np.vstack([matrix[:3], [[0.0, 0.0, 0.0, 1.0]]]), UpAxis.Z)
+        _add(found, name, _opencv(np.vstack([matrix[:3], [[0.0, 0.0, 0.0, 1.0]]]), UpAxis.Z))
     return found
 
 
@@ -204,11 +212,14 @@ def _alembic(path: Path, fps: float | None) -> Poses:
     sampling = longest.getTimeSampling()
     times = [sampling.getSampleTime(k) for k in range(longest.getNumSamples())]
     rate = fps or abc.GetArchiveInfo(archive).get("dccFPS") or _frame_rate(times)
+    nearest: dict[int, float] = {}  # of several samples in a frame, which show how it moves while the shutter is open
+    for time in sorted(times, key=lambda time: abs((time * rate + 0.5) % 1.0 - 0.5)):
+        nearest.setdefault(math.floor(time * rate + 0.5), time)
     found: Poses = {}
-    for number in sorted({round(time * rate) for time in times}):
+    for number, time in sorted(nearest.items()):
         matrix = np.eye(4)
         for schema in transforms:
-            sample = schema.getValue(abc.ISampleSelector(number / rate))  # the nearest one
+            sample = schema.getValue(abc.ISampleSelector(time))
             matrix = matrix @ np.array([[sample.getMatrix()[row][k] for row in range(4)] for k in range(4)])
         found[number] = _opencv(_without_scale(matrix), UpAxis.Y)
     return found

@@ -15,8 +15,9 @@ from factorsfm.adjustment.state import State
 from factorsfm.control.factor_term import FactorTerm
 from factorsfm.control.fit import ControlFit, ControlResidual
 from factorsfm.control.residuals import SCALE_STD, MarkItem, Place
-from factorsfm.control.solve import KERNEL, Controlled, described, options_under_control
+from factorsfm.control.solve import Controlled, described, options_under_control
 from factorsfm.control.solved_control import triangulated
+from factorsfm.control.start import KERNEL
 from factorsfm.graph.factors_on_poses import FactorsOnPoses
 from factorsfm.support.rotations import camera_centers
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from factorsfm.priors.masks import MaskPrior
 from factorsfm.support.errors import InputError
 from factorsfm.support.up_axis import UpAxis
@@ -54,8 +56,12 @@ class ExportOptions:
     def __post_init__(self) -> None:
         for name, (low, high, unit) in _RANGES.items():
             value = getattr(self, name)
-            if value is not None and not low <= value <= high:
-                raise InputError(f"{name} is {value:g}; a number from {low:g} to {high:g} ({unit}) is expected")
+            number = isinstance(value, int | float | np.number)
+            if value is not None and not (number and low <= value <= high):
+                said = f"{value:g}" if number else repr(value)
+                raise InputError(f"{name} is {said}; a number from {low:g} to {high:g} ({unit}) is expected")
+        if self.first_frame is not None and not isinstance(self.first_frame, int | np.integer):
+            raise InputError(f"first_frame is {self.first_frame}; a whole number is expected")
         if self.up_axis is not None and self.up_axis not in set(UpAxis):
             raise InputError(f'up_axis is "{self.up_axis}"; one of {", ".join(UpAxis)} is expected')
         if self.footage is not None and not Path(self.footage).exists():

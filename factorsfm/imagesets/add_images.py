@@ -36,6 +36,7 @@ from factorsfm.tracks.matches import match_images
 
 _MOST_OF_A_SHOT = 40  # frames of a shot that new images are matched with
 _SAME_ASPECT = 0.01
+_NO_TRACKS = "The tracks of the shot are not kept: only the result without these images can be solved again."
 
 
 def add_images(
@@ -217,6 +218,8 @@ class _Extension:
         result = extended(self._base, self._frames, views, mapper, self._local, refine=self._refine)
         result.options = {**self._base.options, "added": [asdict(part) for part in self._added]}
         result.notes.append(f"{len(registered)} of {len(self._new)} further images were registered on the result.")
+        if self._base.measured is not None:  # that is of the frames of a shot, and the points are others now
+            result.notes.append(_NO_TRACKS)
         for view in self._new:
             if view not in registered:
                 result.notes.append(f"{view.frame.name} could not be registered: {view.frame.message}.")

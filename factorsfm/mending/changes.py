@@ -76,12 +76,13 @@ class Changes:
     """What is changed before a shot is solved again.
 
     Attributes:
-        tracks: that are left out, by their numbers or names; regions: in which nothing counts.
+        tracks: that are left out, by their numbers or names (a text that is both is a name); regions: in which nothing
+            counts.
         frames: to which it is cut, None for all.
         control: what is known beforehand, None where that stays as it was; control_from: its file.
     """
 
-    tracks: tuple[str, ...]
+    tracks: tuple[int | str, ...]
     regions: tuple[MaskRegion, ...]
     frames: slice | None
     control: Control | None
@@ -102,12 +103,14 @@ class Changes:
             first_number: as in `read_control`.
 
         Raises:
-            InputError: a region, the range or the control cannot be used.
+            InputError: a track, a region, the range or the control cannot be used.
         """
+        tracks = _listed("without_tracks", without_tracks, int | str | np.integer, "numbers and names of tracks")
+        regions = _listed("mask_regions", mask_regions, MaskRegion | str, "regions")
         read = read_control(control, first_number) if isinstance(control, str | Path) else control
         return cls(
-            tuple(map(str, without_tracks)),
-            tuple(r if isinstance(r, MaskRegion) else MaskRegion.parse(r) for r in mask_regions),
+            tracks,
+            tuple(r if isinstance(r, MaskRegion) else MaskRegion.parse(r) for r in regions),
             None if frames is None else checked_range(frames),
             read,
             str(control) if isinstance(control, str | Path) else None,
@@ -134,7 +137,7 @@ class Changes:
     def said(self) -> dict[str, Any]:
         """As the options of a result hold them."""
         return {
-            "without_tracks": list(self.tracks),
+            "without_tracks": [str(track) for track in self.tracks],
             "mask_regions": [str(region) for region in self.regions],
             "frames": None if self.frames is None else range_text(self.frames),
             "control": self.control_from or ("given" if self.control is not None else None),
@@ -153,7 +156,16 @@ class Changes:
         return notes
 
 
-def _without_tracks(measured: MeasuredShot, names: Sequence[str]) -> MeasuredShot:
+def _listed(name: str, given: Any, kinds: Any, expected: str) -> tuple[Any, ...]:
+    """What is in an argument that is a list; a text is no list of its letters."""
+    listed = isinstance(given, Iterable) and not isinstance(given, str)
+    items = tuple(given) if listed else ()
+    if not listed or not all(isinstance(item, kinds) and not isinstance(item, bool) for item in items):
+        raise InputError(f"{name} is {given!r:.80}; a list of {expected} is expected")
+    return items
+
+
+def _without_tracks(measured: MeasuredShot, names: Sequence[int | str]) -> MeasuredShot:
     """Without some tracks, by their numbers or names.
 
     Raises:
@@ -172,12 +184,16 @@ def _without_tracks(measured: MeasuredShot, names: Sequence[str]) -> MeasuredSho
     )
 
 
-def _ids_of(measured: MeasuredShot, names: Sequence[str]) -> Index:
-    """(n,) ids, ascending, of tracks by their numbers or names."""
+def _ids_of(measured: MeasuredShot, names: Sequence[int | str]) -> Index:
+    """(n,) ids, ascending, of tracks by their numbers or names.
+
+    A text that is both, as "5" where the user has called a track so, is the name.
+    """
     there = np.unique(np.concatenate([image.tracks.ids for image in measured.images]))
-    by_name = dict(zip(measured.supervised.names, measured.supervised.ids.tolist(), strict=True))
+    by_name: dict[int | str, int] = {}
     for track in there.tolist():
-        by_name |= {track_name(track): track, str(track + 1): track}
+        by_name |= {track_name(track): track, str(track + 1): track, track + 1: track}
+    by_name |= zip(measured.supervised.names, measured.supervised.ids.tolist(), strict=True)
     if missing := [name for name in names if name not in by_name]:
         raise InputError(f"there is no track {missing[0]} among the {len(there):,} tracks of the result")
     return np.unique(np.array([by_name[name] for name in names], np.int64))

@@ -18,6 +18,8 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 _GREY = 128  # of a point whose colour nobody has looked up
+_BESIDE_PX = 5.0  # beyond the border: a tracker follows a corner out of the picture so far
+_MOST_BESIDE = 0.25  # share of the places beyond that: a plane that a tracker extrapolates may leave the picture, too
 
 
 def joined(measured: MeasuredShot, given: UserTracks, lenses: dict[int, pycolmap.Camera] | None = None) -> MeasuredShot:
@@ -28,9 +30,10 @@ def joined(measured: MeasuredShot, given: UserTracks, lenses: dict[int, pycolmap
         lenses: of the frames by their numbers, for tracks that lie on undistorted footage; None: that of all frames.
 
     Raises:
-        InputError: no track has two frames of the shot, a lens has no place for one, or they lie on undistorted footage
-            and no lens is known.
+        InputError: no track has two frames of the shot, a lens has no place for one, they lie on undistorted footage
+            and no lens is known, or they are of an image of another size.
     """
+    _check_size(given, measured.camera)
     if given.on == "undistorted" and lenses is None and not measured.lens_given:
         raise InputError(f"{given.source}: tracks on undistorted footage need its lens; a camera is expected")
     position = {frame.index: k for k, frame in enumerate(measured.frames)}
@@ -49,7 +52,7 @@ def joined(measured: MeasuredShot, given: UserTracks, lenses: dict[int, pycolmap
         for frame, xy in zip(track.frames.tolist(), track.xy, strict=True):
             if frame in position:
                 seen.setdefault(position[frame], []).append((own, xy))
-    images = list(measured.images)
+    images, beside = list(measured.images), list[Array]()
     for k, places in seen.items():
         camera = measured.camera if lenses is None else lenses.get(measured.frames[k].index, measured.camera)
         xy = on_footage(np.array([place for _, place in places]), given, camera)
@@ -57,8 +60,10 @@ def joined(measured: MeasuredShot, given: UserTracks, lenses: dict[int, pycolmap
             row = int(np.argmin(np.isfinite(xy).all(axis=1)))
             name = kept[places[row][0] - first].name
             raise InputError(f"{given.source}: {name} is outside of the lens in frame {measured.frames[k].index}")
+        beside.append(_beside(xy, camera))
         tracks = images[k].tracks.joined(np.array([own for own, _ in places]), xy)
         images[k] = replace(images[k], tracks=tracks)
+    _check_inside(given, np.concatenate(beside), measured.camera)
     known, colors = measured.supervised, np.full((first + len(kept), 3), _GREY, np.uint8)
     colors[: min(first, len(measured.colors))] = measured.colors[:first]
     supervised = SupervisedTracks(
@@ -70,6 +75,32 @@ def joined(measured: MeasuredShot, given: UserTracks, lenses: dict[int, pycolmap
     if away := len(given.tracks) - len(kept):
         notes = (*notes, f"Of {given.source}, {away} of {len(given.tracks)} have no frame of the shot.")
     return replace(measured, images=images, supervised=supervised, colors=colors, notes=notes)
+
+
+def _check_size(given: UserTracks, camera: pycolmap.Camera) -> None:
+    if given.size is not None and given.size != (camera.width, camera.height):
+        width, height = given.size
+        raise InputError(
+            f"{given.source}: they are of an image of {width}x{height} pixels, the footage has "
+            f"{camera.width}x{camera.height}; tracks of footage of that size are expected"
+        )
+
+
+def _beside(xy: Array, camera: pycolmap.Camera) -> Array:
+    """(n,) how far places are beyond the border of the image, pixels; negative inside."""
+    size = np.array([camera.width, camera.height])
+    return np.asarray(np.maximum(-PIXEL_CENTER - xy, xy - (size - PIXEL_CENTER)).max(axis=1))
+
+
+def _check_inside(given: UserTracks, beside: Array, camera: pycolmap.Camera) -> None:
+    """Insist that most places are in the image: those of an image of another size would bend the cameras."""
+    outside = int((beside > _BESIDE_PX).sum())
+    if outside > _MOST_BESIDE * len(beside):
+        raise InputError(
+            f"{given.source}: {outside} of {len(beside)} places are outside of the footage of "
+            f"{camera.width}x{camera.height} pixels, by up to {beside.max():.0f}; tracks of footage of that size are "
+            "expected"
+        )
 
 
 def on_footage(xy: Array, given: UserTracks, camera: pycolmap.Camera) -> Array:

@@ -11,13 +11,16 @@ from factorsfm.mending.changes import Changes, MaskRegion
 from factorsfm.mending.joined import joined
 from factorsfm.mending.same_world import in_world_of
 from factorsfm.mending.user_tracks import UserTracks, read_tracks
+from factorsfm.polish.measured import MeasuredShot
+from factorsfm.polish.polished import Polished
 from factorsfm.report.thumbnails import take_from_report
+from factorsfm.result.frame_results import mapped_results
 from factorsfm.result.left_out import add_left_out
 from factorsfm.result.reading import read_result
-from factorsfm.result.reconstruction import Reconstruction
-from factorsfm.result.repeats import add_recorded
+from factorsfm.result.reconstruction import FrameResult, Reconstruction
+from factorsfm.result.repeats import add_recorded, add_results
 from factorsfm.result.solved_shot import solved_shot
-from factorsfm.support.errors import InputError
+from factorsfm.support.errors import InputError, ReconstructionError
 from factorsfm.support.progress import Progress
 from factorsfm.support.threads import OneThreadEach
 
@@ -39,7 +42,8 @@ def solve_again(
 
     Args:
         result: that of a video; its folder, or a `Reconstruction`.
-        without_tracks: tracks that are left out: numbers as in COLMAP's model and in names of tracks, or names.
+        without_tracks: tracks that are left out: numbers as in COLMAP's model and in names of tracks, or names, which
+            come before numbers in texts.
         mask_regions: in which nothing counts, or their texts, see `MaskRegion.parse`.
         frames: the others are left out; numbers as in the result.
         control: what is known beforehand, or its JSON file; None is that of the result, if it had some.
@@ -65,7 +69,7 @@ def solve_again(
     if tracks is not None:
         measured = joined(measured, tracks, {frame.index: known.camera_of(frame) for frame in known.frames})
     with OneThreadEach():
-        polished = measured.solved(lambda stage: progress(stage, 0, None) if progress else None)
+        polished = _polished(measured, known, progress)
         solved = solved_shot(measured, polished, {"polish": time.perf_counter() - begin})
     add_recorded(solved, measured.footage)
     solved = in_world_of(known, solved)
@@ -77,6 +81,16 @@ def solve_again(
     return solved
 
 
+def _polished(measured: MeasuredShot, known: Reconstruction, progress: Progress | None) -> Polished:
+    """The final solve; an error knows what has become of the frames."""
+    try:
+        return measured.solved(lambda stage: progress(stage, 0, None) if progress else None)
+    except ReconstructionError as error:
+        frames = add_results(mapped_results(measured.frames, measured.images), measured.footage)
+        _take_over_pictures(frames, known)
+        raise ReconstructionError(str(error), frames) from error
+
+
 def read_with_pictures(directory: str | Path) -> Reconstruction:
     """A result, read back, with the pictures of its report; errors as in `read_result`."""
     result = read_result(directory)
@@ -86,11 +100,15 @@ def read_with_pictures(directory: str | Path) -> Reconstruction:
 
 def _take_over_frames(solved: Reconstruction, known: Reconstruction, changes: Changes) -> None:
     """The pictures of the frames; and the frames that were not measured as they are, such as slates beside the shot."""
-    by_index = {frame.index: frame for frame in known.frames}
-    for frame in solved.frames:
-        frame.thumbnail = by_index[frame.index].thumbnail
+    _take_over_pictures(solved.frames, known)
     there = {frame.index for frame in solved.frames}
     add_left_out(solved, [f for f in known.frames if f.index not in there and changes.keeps(f.index)])
+
+
+def _take_over_pictures(frames: Iterable[FrameResult], known: Reconstruction) -> None:
+    by_index = {frame.index: frame for frame in known.frames}
+    for frame in frames:
+        frame.thumbnail = by_index[frame.index].thumbnail
 
 
 def _not_again(known: Reconstruction) -> list[str]:

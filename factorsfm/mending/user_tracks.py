@@ -31,6 +31,8 @@ _Curves = dict[str, dict[int, tuple[float, float]]]  # by name and number of the
 DEFAULT_SIGMA_PX = 0.5  # of a place that a person has set with care; automatic trackers are better
 _LARGEST = 1e6  # pixels and numbers of frames: beyond, a file holds something else
 _LONGEST_NAME = 100
+_COLUMNS = ("track", "frame", "x", "y")  # of a table
+_MOST_SHOWN = 100  # characters of a line
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,8 +41,8 @@ class UserTrack:
 
     Attributes:
         name: as the user calls it.
-        frames: (k,) numbers of the frames as in a result, ascending.
-        xy: (k, 2) pixels with centres at integers; see `UserTracks`.
+        frames: (k,) numbers of the frames as in a result, ascending; a list does.
+        xy: (k, 2) pixels with centres at integers; see `UserTracks`. A list does.
 
     Raises:
         InputError: there is no place, a frame is there twice, or a value is none.
@@ -51,15 +53,24 @@ class UserTrack:
     xy: Array
 
     def __post_init__(self) -> None:
-        frames, xy = np.asarray(self.frames), np.asarray(self.xy, np.float64)
+        if not isinstance(self.name, str) or not _is_name(self.name):
+            raise InputError(f"a track is called {self.name!r:.{_LONGEST_NAME}}; a name in one line is expected")
+        try:
+            frames, xy = np.asarray(self.frames, np.float64), np.asarray(self.xy, np.float64)
+        except (TypeError, ValueError) as error:
+            raise InputError(f'track "{self.name}" has frames or places that are no numbers') from error
         if frames.ndim != 1 or xy.shape != (len(frames), 2) or not len(frames):
             raise InputError(f'track "{self.name}" has frames of shape {frames.shape} and places of shape {xy.shape}')
         if (np.diff(frames) <= 0).any():
             raise InputError(f'the frames of track "{self.name}" do not ascend')
-        if not (np.abs(xy) < _LARGEST).all() or (np.abs(frames) > _LARGEST).any():
+        if not (np.abs(xy) < _LARGEST).all() or not (np.abs(frames) <= _LARGEST).all() or (frames % 1.0).any():
             raise InputError(f'track "{self.name}" has a place or a frame that is none')
-        if not self.name.strip() or len(self.name) > _LONGEST_NAME or not self.name.isprintable():
-            raise InputError(f"a track is called {self.name[:_LONGEST_NAME]!r}; a name in one line is expected")
+        object.__setattr__(self, "frames", frames.astype(np.int64))
+        object.__setattr__(self, "xy", xy)
+
+
+def _is_name(text: str) -> bool:
+    return bool(text.strip()) and len(text) <= _LONGEST_NAME and text.isprintable()
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +83,7 @@ class UserTracks:
         on: the plate on which they lie: the "footage" with its distortion, or the footage "undistorted".
         from_bottom: whether their y counts upwards, from the bottom edge of the image (not from a pixel's centre).
         source: where they come from, for people.
+        size: width and height of the image that they were placed in, pixels, if that is known.
 
     Raises:
         InputError: there is no track, two have the same name, or the standard deviation is none.
@@ -82,6 +94,7 @@ class UserTracks:
     on: Plate = "footage"
     from_bottom: bool = False
     source: str = "the tracks"
+    size: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
         if not self.tracks:
@@ -140,7 +153,8 @@ def read_tracks(
     except (ValueError, LookupError, OverflowError, RecursionError, InputError) as error:
         raise InputError(f"tracks {path}: {error}") from error
     plate: Plate = on or ("undistorted" if format == "tracks-nuke" else "footage")
-    return UserTracks(tracks, sigma, plate, not from_top, f"tracks {path}")
+    size = _size_in_after_effects(text) if format == "tracks-after-effects" else None
+    return UserTracks(tracks, sigma, plate, not from_top, f"tracks {path}", size)
 
 
 def _format_of(text: str, path: Path) -> tuple[str, Callable[[str], _Curves]]:
@@ -164,12 +178,21 @@ def _format_of(text: str, path: Path) -> tuple[str, Callable[[str], _Curves]]:
 def _of_table(text: str) -> _Curves:
     """A header with track, frame, x and y, and further columns that are not read."""
     reader = csv.DictReader(io.StringIO(text))
-    columns = reader.fieldnames or []
-    if missing := [name for name in ("track", "frame", "x", "y") if name not in columns]:
-        raise ValueError(f"the table has no column {missing[0]}; it has {', '.join(columns)}")
     found: _Curves = defaultdict(dict)
-    for row in reader:
-        _add(found[row["track"] or ""], row["track"], row["frame"], row["x"], row["y"], f"line {reader.line_num}")
+    whole = 0  # lines of whole rows
+    try:
+        columns = reader.fieldnames or []
+        if missing := [name for name in _COLUMNS if name not in columns]:
+            raise ValueError(f"the table has no column {missing[0]}; it has {', '.join(columns)[:_MOST_SHOWN]}")
+        whole = reader.line_num
+        for row in reader:
+            track, number, x, y = (row[name] for name in _COLUMNS)
+            if "\n" in f"{track}{number}{x}{y}":
+                raise csv.Error
+            _add(found[track or ""], track, number, x, y, f"line {reader.line_num}")
+            whole = reader.line_num
+    except csv.Error:
+        raise ValueError(f"after line {whole} a row does not end, as where a quote is not closed") from None
     return found
 
 
@@ -229,6 +252,12 @@ def _of_after_effects(text: str) -> _Curves:
             number, x, y = (*words, "", "")[:3]
             _add(places, name, number, x, y, f"line {k}")
     return found
+
+
+def _size_in_after_effects(text: str) -> tuple[int, int] | None:
+    """Width and height of the footage with trackers; that of a layer with positions is of the layer alone."""
+    said = re.findall(r"^\tSource (?:Width|Height)\t(\d+)\s*$", text, re.MULTILINE)
+    return (int(said[0]), int(said[1])) if len(said) == 2 and "\tFeature Center" in text else None
 
 
 def _count(text: str, what: str) -> int:

@@ -52,11 +52,14 @@ function sortRows(key) {
 }
 
 function showCommand() {
-  const numbers = [...list.chosen].map(row => data.listed.number[row]).sort((a, b) => a - b);
-  byId("mend_command").value = numbers.length
-    ? `factorsfm solve ${shellWord(resultFolder())} --without-tracks ${numbers.join(" ")} --output ${shellWord(resultFolder() + "-mended")}`
+  const {number, name} = data.listed, names = new Set(name);
+  // A number that the user has called another track is its name to the command.
+  const words = [...list.chosen].sort((a, b) => number[a] - number[b])
+    .map(row => names.has(String(number[row])) ? shellWord(name[row]) : number[row]);
+  byId("mend_command").value = words.length
+    ? `factorsfm solve ${shellWord(resultFolder())} --without-tracks ${words.join(" ")} --output ${shellWord(resultFolder() + "-mended")}`
     : "";
-  byId("mend_copy").disabled = byId("mend_none").disabled = !numbers.length;
+  byId("mend_copy").disabled = byId("mend_none").disabled = !words.length;
   byId("mend_copy").textContent = "Copy";
 }
 

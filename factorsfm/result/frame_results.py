@@ -69,6 +69,22 @@ def frame_results(
     return results
 
 
+def mapped_results(frames: Sequence[SourceFrame], images: Sequence[MappedImage]) -> list[FrameResult]:
+    """What has become of the frames of a shot that is not solved, or cannot be."""
+    return [
+        FrameResult(
+            frame.index, frame.name, frame.timestamp, image.status, image.message, pose_of(image),
+            image.keyframe, len(image.tracks.ids), image.inliers,
+        )
+        for frame, image in zip(frames, images, strict=True)
+    ]  # fmt: skip
+
+
+def pose_of(image: MappedImage) -> pycolmap.Rigid3d | None:
+    """`cam_from_world` of an image; None where it is not registered."""
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(image.rotation), image.translation) if image.registered else None
+
+
 def _add_solution(
     result: FrameResult, polished: Polished, row: int, errors: NDArray[np.float64], camera: pycolmap.Camera, unit: float
 ) -> None:

@@ -13,7 +13,7 @@ from factorsfm.frames.frame import Frame
 from factorsfm.frames.texture import BLANK_TEXTURE
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.mapping.mapper import Mapper
-from factorsfm.result.reconstruction import FrameResult
+from factorsfm.result.frame_results import pose_of
 from factorsfm.support.errors import InputError
 from factorsfm.support.status import FrameStatus
 
@@ -141,22 +141,6 @@ def mark_blank(mapper: Mapper, position: int, texture: float) -> None:
     if texture < BLANK_TEXTURE:
         contrast = f"contrast {texture:.2f} of {BLANK_TEXTURE:.2f} needed grey levels"
         mapper.explain(position, FrameStatus.BLANK, contrast)
-
-
-def frame_results(frames: Sequence[SeenFrame], images: Sequence[MappedImage]) -> list[FrameResult]:
-    """What has become of the frames of a shot that cannot be reconstructed."""
-    return [
-        FrameResult(
-            frame.index, frame.name, frame.timestamp, image.status, image.message, pose_of(image),
-            image.keyframe, len(image.tracks.ids), image.inliers,
-        )
-        for frame, image in zip(frames, images, strict=True)
-    ]  # fmt: skip
-
-
-def pose_of(image: MappedImage) -> pycolmap.Rigid3d | None:
-    """`cam_from_world` of an image; None where it is not registered."""
-    return pycolmap.Rigid3d(pycolmap.Rotation3d(image.rotation), image.translation) if image.registered else None
 
 
 def _newest_prior(mapper: Mapper, frames: Sequence[SeenFrame]) -> KeyframePrior | None:

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from factorsfm.mapping.live_covariance import carried
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.mapping.mapper import Mapper
+from factorsfm.result.frame_results import mapped_results
 from factorsfm.result.other_world import in_other_world
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
-from factorsfm.streaming.frame_update import SeenFrame, frame_results
+from factorsfm.streaming.frame_update import SeenFrame
 from factorsfm.streaming.relocalization import Relocalizer
 from factorsfm.support.errors import InputError
 from factorsfm.support.similarity import Similarity, covariance_in_unit, pose_arrays
@@ -94,7 +95,7 @@ class Horizon:
         """
         if not self.begin or self.frames is None:
             return result
-        found, live = result.frames, frame_results(frames, images)
+        found, live = result.frames, mapped_results(frames, images)
         both = [k for k, frame in enumerate(found) if frame.registered and live[self.begin + k].registered]
         if not both:
             return result

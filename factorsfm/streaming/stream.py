@@ -27,7 +27,7 @@ from factorsfm.priors.image_depth import ImageDepth
 from factorsfm.priors.masks import MaskPrior
 from factorsfm.priors.read_priors import read_mask
 from factorsfm.report.thumbnails import Thumbnails
-from factorsfm.result.frame_results import SourceFrame
+from factorsfm.result.frame_results import SourceFrame, mapped_results, pose_of
 from factorsfm.result.lost_frames import with_large_steps
 from factorsfm.result.reconstruction import Reconstruction
 from factorsfm.result.repeats import add_recorded, add_results
@@ -39,11 +39,9 @@ from factorsfm.streaming.frame_update import (
     FrameUpdate,
     SeenFrame,
     check_size,
-    frame_results,
     frame_update,
     keyframe_times,
     mark_blank,
-    pose_of,
 )
 from factorsfm.streaming.horizon import FRAMES, Horizon, recent
 from factorsfm.streaming.imu_source import ImuSource, restore_imu
@@ -333,7 +331,7 @@ class Stream(Closing):
                 result = self._horizon.with_all(ended.reconstruction(progress), self.frames, ended.mapper.images)
             except ReconstructionError as error:
                 images = self._mapper.images if self._mapper is not None else []
-                frames = frame_results(self.frames, images)
+                frames = mapped_results(self.frames, images)
                 self._thumbnails.attach(frames)
                 reason = with_large_steps(str(error), frames, images)
                 raise ReconstructionError(reason, add_results(frames, self._footage.recorded)) from error

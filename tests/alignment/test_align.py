@@ -11,7 +11,7 @@ import pytest
 from factorsfm import Length, Pick, Reconstruction, align, read_result
 from factorsfm.alignment.edges import find_edges, up_from_edges
 from factorsfm.alignment.ground import level_ground
-from factorsfm.alignment.picks import picked_point
+from factorsfm.alignment.picks import PickedPoint, picked_point, plane_normal
 from factorsfm.cli.main import main
 from factorsfm.control.fit import ControlFit
 from factorsfm.report.result_folder import write_folder
@@ -108,6 +108,42 @@ def test_three_picks_are_the_ground_and_a_height_gives_the_scale() -> None:
     )
 
 
+@pytest.mark.parametrize(("frame", "away"), [(0, 0.0), (0, 0.1), (0, 2.9), (5, 0.1), (5, 2.9)])
+def test_an_axis_needs_a_direction(frame: int, away: float) -> None:
+    result = room()
+    place = np.array([0.3, FLOOR, 4.5])
+    origin = pixel(result, place)
+    there, here = pixel(result, place, frame), f"{origin.x:g},{origin.y:g}"
+    message = rf"is [0-9.e-]+ pixels from 0:{here}, which tells no direction; pick one further away"
+    with pytest.raises(InputError, match=message):
+        align(result, origin=origin, axis=replace(there, x=there.x + away))
+    assert align(result, origin=origin, axis=replace(there, x=there.x + 3.5)).alignment.x_from == "pick"
+
+
+@pytest.mark.parametrize(
+    ("third", "std", "message"),
+    [
+        ((0.0, 1.0, 6.0), 0.01, None),  # of a floor
+        ((0.0, 1.0, 4.0), 0.01, "on a line, or nearly; pick a third one off the line"),
+        ((0.0, 1.0, 4.2), 0.2, "on a line, or nearly; pick a third one off the line"),
+        ((0.0, 1.0, 6.0), 0.2, r"the camera is 1 above the plane .*, give or take 0\.73, which tells no ground; pick"),
+        # Behind the row of pixels the scene goes back and forth.
+        ((0.0, 1.5, 6.0), 0.01, r"the camera is 0 above the plane .*, give or take 0\.037, which tells no ground"),
+        ((0.0, 1.49, 6.0), 0.01, r"the camera is 0\.019 above the plane .*, give or take 0\.037, which tells"),
+    ],
+)
+def test_a_ground_is_no_line_in_the_picture(third: tuple[float, ...], std: float, message: str | None) -> None:
+    points = [PickedPoint(np.array(p), std**2 * np.eye(3)) for p in ((-1.0, 1.0, 4.0), (1.0, 1.0, 4.0), third)]
+    eyes = [np.zeros(3)] * 3
+    if message is not None:
+        with pytest.raises(InputError, match=message):
+            plane_normal(points, eyes)
+        return
+    normal, degrees = plane_normal(points, eyes)
+    np.testing.assert_allclose(np.abs(normal), [0, 1, 0], atol=1e-12)
+    assert degrees == pytest.approx(np.degrees(1.5 * std * np.sqrt(5) / 4), rel=1e-4)  # they are 4 / sqrt(5) broad
+
+
 def test_covariances_and_priors_go_with_the_unit() -> None:
     result = room()
     covariance = np.diag([1.0, 2, 3, 4, 5, 6])
@@ -199,6 +235,12 @@ def test_the_command_writes_a_result_that_says_how_it_is_aligned(
         ({"origin": "0:900,1"}, "outside of the frame, which has 480x270"),
         ({"camera_height": -1.0}, "the camera height is -1"),
         ({"distance": Length("0:240,200", "0:240,200", 1.0)}, "pick points further apart"),
+        ({"origin": ""}, '"" is no pixel of a frame; FRAME:X,Y is expected'),
+        ({"origin": "0:240,200", "axis": ""}, '"" is no pixel of a frame; FRAME:X,Y is expected'),
+        ({"camera_height": 1e300}, r"the camera height is 1e\+300; a number of metres from 1e-09 to 1e\+09 is"),
+        ({"distance": Length("0:100,200", "0:400,200", 1e300)}, r"the distance is 1e\+300; a number of metres from"),
+        ({"distance": Length("0:100,200", "0:400,200", 1e-300)}, "the distance is 1e-300; a number of metres from"),
+        ({"distance": Length("0:100,200", "0:400,200", 1.0, 1e300)}, r"deviation of the distance is 1e\+300; 0 to"),
         ({"distance": Length("0:1,1", "0:9,9", 1.0), "camera_height": 1.0}, "one of them sets the scale"),
     ],
 )

@@ -73,6 +73,39 @@ def test_ros_camera_info(tmp_path: Path, kind: str, coefficients: list[float], m
     np.testing.assert_allclose(camera.img_from_cam(RAYS) - 0.5, expected.reshape(-1, 2), atol=1e-9)
 
 
+ECHOED = """header:
+  stamp:
+    sec: 1700000000
+  frame_id: ''
+height: 480
+width: 640
+distortion_model: plumb_bob
+{d}
+{k}
+roi:
+  height: 0
+  width: 0
+  do_rectify: false
+"""
+
+
+@pytest.mark.parametrize("block", [True, False])
+@pytest.mark.parametrize("names", ["DK", "dk"])  # of ROS 1 and 2
+def test_ros_camera_info_as_it_is_echoed(block: bool, names: str, tmp_path: Path) -> None:
+    """Its message, with lists in lines of their own or in one, and further messages behind it."""
+
+    def listed(name: str, values: list[float]) -> str:
+        return f"{name}:" + ("".join(f"\n- {value}" for value in values) if block else f" {values}")
+
+    coefficients = [-0.1, 0.02, 0.001, -0.002, 0.0]
+    message = ECHOED.format(d=listed(names[0], coefficients), k=listed(names[1], MATRIX.ravel().tolist()))
+    (tmp_path / "info.yaml").write_text(f"# echoed\n---\n{message}---\n{message}---\n")
+    camera = read_camera(tmp_path / "info.yaml")
+    assert (camera.width, camera.height, camera.model_name) == (640, 480, "OPENCV")
+    expected = cv2.projectPoints(RAYS, np.zeros(3), np.zeros(3), MATRIX, np.array(coefficients))[0][:, 0]
+    np.testing.assert_allclose(camera.img_from_cam(RAYS) - 0.5, expected, atol=1e-9)
+
+
 def test_colmap_s_cameras(tmp_path: Path) -> None:
     model = pycolmap.Reconstruction()
     camera = pycolmap.Camera(model="RADIAL", params=[600, 321, 241, -0.1, 0.02], camera_id=3, **SIZE)
@@ -150,6 +183,11 @@ def test_opentrackio_from_distorted_to_undistorted(
     ("name", "text", "message"),
     [
         ("a.yml", "image_width: 640", "no 3x3 matrix"),
+        ("a.yml", "width: 640\nheight: 480\nK: [1, 0, 1]\n", "it has no 3x3 matrix under camera_matrix, .*, K, k"),
+        ("a.yml", "width: 640\nheight: 480\nK: [[1, 0, 1], [0, 1, 1], [0, 0, 1]]\n", "K holds something else than"),
+        ("a.yml", "width: 640\nheight: 480\nK: [a, b, c, d, e, f, g, h, i]\n", "K holds something else than"),
+        ("a.yml", f"width: 640\nheight: 480\nK: {MATRIX.ravel().tolist()}\nD: [much]\n", "D holds something else than"),
+        ("a.yml", "---\n# nothing\n", "no 3x3 matrix"),
         ("a.yml", "{{{", "it has no 3x3 matrix|not YAML"),
         ("a.txt", "# nothing\n", "it holds 0 cameras; one is expected"),
         ("a.txt", "1 PINHOLE 640\n", "CAMERA_ID, MODEL, WIDTH, HEIGHT"),

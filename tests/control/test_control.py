@@ -393,6 +393,26 @@ def test_what_contradicts_the_images_is_flagged_and_does_not_drag_the_rest(what:
     assert 3e-4 < np.abs(position - true_centers(noisy)).max() < 0.003
 
 
+@pytest.mark.parametrize("off", [5.0, 15.0, 1e3, 1e5])
+def test_a_wild_pose_among_loose_ones_is_named(off: float, exact: Problem) -> None:
+    """As in the file of another program, whose sigmas are a share of a path that has the wild pose in it."""
+    extent = np.ptp(true_centers(exact), axis=0).max()
+    poses = [known_pose(exact, k, 0.01 * off * extent, 0.5) for k in range(len(exact.truth.rotation))]
+    poses[3] = known_pose(exact, 3, 0.01 * off * extent, 0.5, noise=off * extent)
+    if off == 1e5:  # the path is nothing beside a sigma
+        with pytest.raises(ReconstructionError, match=r"shrinks to a point; position of 003.jpg is .* off by 1\d\d s"):
+            solve(exact, Control(poses))
+        return
+    result = solve(exact, Control(poses))
+    assert result.control is not None
+    assert [r.name for r in result.control.residuals if r.contradicts] == ["position of 003.jpg"]
+    if off == 1e3:
+        assert result.world_alignment is None
+    else:
+        error = np.abs(placed(result)[1] - true_centers(exact)).max() / extent
+        assert error == pytest.approx(1.3e-4 * off, rel=0.1)  # its small weight still pulls
+
+
 # --- what is left open ------------------------------------------------------------------------------------------
 
 

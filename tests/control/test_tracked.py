@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from factorsfm.control.files import read_control
-from factorsfm.control.known import Control, find_frames
+from factorsfm.control.known import Control, KnownDistance, KnownPose, MarkedPoint, find_frames
 from factorsfm.export import ExportOptions, export
 from factorsfm.result.reconstruction import Reconstruction
 from factorsfm.support.errors import InputError
@@ -180,11 +180,126 @@ def test_a_control_file_can_say_how_well_it_is_known(tmp_path: Path) -> None:
     assert len(control.distances) == 1
 
 
+def test_what_is_left_out_has_no_say_in_how_well_the_rest_is_known(tmp_path: Path) -> None:
+    path = chan(tmp_path / "a.chan", 1001, 30)
+    near = read_control(path)
+    far = "\n".join(f"{1101 + k} {1e4 * k} 5e3 0 0 0 0" for k in range(100))
+    path.write_text(path.read_text() + far)
+    control, frames = read_control(path), range(10, 20)
+    explicit = KnownPose(15, [1, 2, 3], 0.7)
+    mixed = Control([explicit, *(pose for pose in control.poses if pose.frame != 15)], spare=True).within(frames)
+    assert mixed.poses[0] == explicit
+    for poses, steps in (
+        (near.poses, 29),
+        (near.within(frames).poses, 9),
+        (control.within(frames).poses, 9),
+        (mixed.poses[1:], 9),
+    ):
+        np.testing.assert_allclose([pose.sigma for pose in poses], 0.01 * 0.5 * steps, rtol=1e-12)
+    with pytest.raises(InputError, match="a single position leaves the scale open; give a distance"):
+        near.within([15])
+
+
+def test_of_samples_while_the_shutter_is_open_the_whole_frame_counts(tmp_path: Path) -> None:
+    abc = pytest.importorskip("alembic3d.Abc", reason="alembic3d (extra alembic) is not installed")
+    from alembic3d.AbcCoreAbstract import TimeSampling
+    from alembic3d.AbcGeom import CameraSample, OCamera, OXform, XformSample
+    from imath import M44d
+
+    archive = abc.OArchive(str(tmp_path / "a.abc"))
+    sampling = archive.addTimeSampling(TimeSampling(0.25 / 24, 1001 / 24 - 0.25 / 24))
+    xform = OXform(archive.getTop(), "camera", sampling)
+    for k in range(-1, 14):  # frames 1001 to 1004, and quarters of one beside them
+        sample = XformSample()
+        sample.setMatrix(M44d(1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0.25 * k, 0, 0, 1))
+        xform.getSchema().set(sample)
+    OCamera(xform, "shape").getSchema().set(CameraSample())
+    del xform, archive
+    (tmp_path / "control.json").write_text(json.dumps({"cameras": {"file": "a.abc", "fps": 24}}))
+    poses = read_control(tmp_path / "control.json").poses
+    assert [pose.frame for pose in poses] == [0, 1, 2, 3]
+    np.testing.assert_allclose([pose.position for pose in poses], [[k, 0, 0] for k in range(4)], atol=1e-12)
+
+
 def test_frames_that_the_source_does_not_have_are_left_out(tmp_path: Path) -> None:
     control = read_control(chan(tmp_path / "a.chan", 1001, 30))
     assert find_frames(control, [(k, f"{k:06d}") for k in range(5, 9)]) == {5: 0, 6: 1, 7: 2, 8: 3}
     with pytest.raises(InputError, match=r"none of the 30 poses, of frames 0 to 29, is of a frame of the source"):
         find_frames(control, [(k, f"{k:06d}") for k in range(100, 104)])
+
+
+@pytest.mark.parametrize(
+    ("kind", "frames"),
+    [
+        ("colmap", [(k, f"{k:06d}") for k in range(8, 22)]),  # a video: its images are 000010.png and so on
+        ("nerfstudio", [(k, f"{k:06d}") for k in range(8, 22)]),
+        ("colmap", [(k, f"plate.{k:06d}.exr") for k in range(8, 22)]),
+        ("nerfstudio", [(k, f"plate.{k:06d}.exr") for k in range(8, 22)]),  # its images are plate.000010.png
+    ],
+)
+def test_exports_name_the_frames_of_videos_and_plates(tmp_path: Path, kind: str, frames: list[tuple[int, str]]) -> None:
+    reconstruction = hard_reconstruction()
+    for frame in reconstruction.frames:
+        frame.name = dict(frames)[frame.index]
+    export(reconstruction, tmp_path / "out", format=kind)
+    found = find_frames(read_control(tmp_path / "out"), frames)
+    assert [*found.values()] == [frame - 8 for frame in FRAMES]
+
+
+@pytest.mark.parametrize(
+    ("key", "frames", "position"),
+    [
+        ("000012.png", [(11, "000011"), (12, "000012")], 1),
+        ("12.png", [(11, "000011"), (12, "000012")], 1),
+        ("0012.png", [(11, "000011"), (12, "000012")], None),  # perhaps the twelfth, which is 11
+        ("1012.png", [(1011, "a.1011.exr"), (1012, "a.1012.exr")], 1),
+        ("a.1012.png", [(1011, "a.1011.exr"), (1012, "a.1012.exr")], 1),
+        ("a.1012", [(1011, "a.1011"), (1012, "a.1012")], 1),
+        ("1.png", [(0, "bee.jpg"), (1, "cow.jpg")], None),  # a place among photographs is in no file name
+        ("7.png", [(0, "7.jpg"), (7, "0.jpg")], 0),
+        ("cow.png", [(0, "bee.jpg"), (1, "cow.jpg")], 1),
+        ("cow.png", [(0, "cow.tif"), (1, "cow.jpg")], None),
+        ("cow", [(0, "cow.tif"), (1, "cow.jpg")], None),
+        ("left/cow.png", [(0, "bee.jpg"), (1, "cow.jpg")], None),
+    ],
+)
+def test_names_with_another_suffix(key: str, frames: list[tuple[int, str]], position: int | None) -> None:
+    control = Control(distances=[KnownDistance(1.0, 0.1, frames=(key, "other"))])
+    frames = [*frames, (9999, "other")]
+    if position is None:
+        with pytest.raises(InputError, match=f"control: there is no frame '{key}' among the 3 frames"):
+            find_frames(control, frames)
+    else:
+        assert find_frames(control, frames)[key] == position
+
+
+def test_two_names_of_one_frame_are_refused() -> None:
+    message = r"control: '000002\.png' and 2 are the same frame"
+    frames = [(k, f"{k:06d}") for k in range(4)]
+    pair: list[str | int] = ["000002.png", 2]
+    with pytest.raises(InputError, match=message):
+        find_frames(Control(distances=[KnownDistance(1.0, 0.1, frames=pair)]), frames)
+    with pytest.raises(InputError, match=message):
+        find_frames(Control([KnownPose(key, [0, 0, k], 0.1, [0, 0, 0, 1], 1) for k, key in enumerate(pair)]), frames)
+    marks = MarkedPoint("A", {key: [1.0, 2.0] for key in pair})
+    with pytest.raises(InputError, match=message):
+        find_frames(Control(points=[marks], distances=[KnownDistance(1.0, 0.1, frames=(0, 1))]), frames)
+
+
+def test_images_can_be_counted_otherwise(tmp_path: Path) -> None:
+    reconstruction = hard_reconstruction()
+    for k, frame in enumerate(reconstruction.frames):
+        frame.name = f"img_{k + 1:04d}.png"
+    export(reconstruction, tmp_path / "model", format="colmap")
+    said = {"cameras": {"file": "model", "first_frame": 1}}
+    (tmp_path / "control.json").write_text(json.dumps(said))
+    for first_number, first in ((None, 0), (1001, 1001)):
+        poses = read_control(tmp_path / "control.json", first_number).poses
+        assert [pose.frame for pose in poses] == [first + k for k in (0, 1, 2, 4, 5)]
+    reconstruction.frames[0].name = "slate.png"
+    export(reconstruction, tmp_path / "model", format="colmap")
+    with pytest.raises(InputError, match=r"its images, slate.png to img_0006.png, differ in more than a number"):
+        read_control(tmp_path / "control.json")
 
 
 @pytest.mark.parametrize(
@@ -194,8 +309,14 @@ def test_frames_that_the_source_does_not_have_are_left_out(tmp_path: Path) -> No
         ("a.chan", "1 2 3\n", 'the line "1 2 3" is not "frame tx ty tz rx ry rz"'),
         ("a.chan", "1 0 0 0 0 0 0\n2 0 0 0 0 0 0\n", "stands still"),
         ("a.chan", "1 0 0 0 0 0 0\n2 0 nan 0 0 0 0\n", "is not finite"),
+        ("a.chan", "1 0 0 0 0 0 0\n2 1 0 0 0 0 0\n1.0 2 0 0 0 0 0\n", 'frame "1" is there twice'),
         ("a.usda", "no stage", "it is no USD stage"),
         ("transforms.json", '{"frames": [{"file_path": "a", "transform_matrix": [[1]]}]}', "transform_matrix of a is"),
+        (
+            "transforms.json",
+            json.dumps({"frames": [{"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}] * 2}),
+            r'frame "a\.png" is there twice',
+        ),
         ("control.json", '{"cameras": {"sigma": 1}}', "cameras"),
         ("control.json", '{"cameras": {"file": "none.chan"}}', "there is no file"),
         ("control.json", '{"cameras": {"file": "none.fbx"}}', "there is no file"),

@@ -772,6 +772,8 @@ def test_output_can_be_the_working_directory(tmp_path: Path, monkeypatch: pytest
     [
         ({"fps": 0}, "fps is 0; a number from 0.001 to 1e\\+06"),
         ({"fps": math.nan}, "fps is nan; a number from"),
+        ({"fps": "24"}, "fps is '24'; a number from"),
+        ({"first_frame": 10.5}, "first_frame is 10.5; a whole number is expected"),
         ({"sensor_width": -36}, "sensor_width is -36; a number from"),
         ({"scale": math.inf}, "scale is inf; a number from"),
         ({"scale": 1e10}, r"scale is 1e\+10; a number from 1e-09 to 1e\+09 \(a length\) is expected"),

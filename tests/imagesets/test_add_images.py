@@ -203,6 +203,12 @@ def test_photographs_are_added_to_a_shot(tmp_path: Path) -> None:
     errors = trajectory_errors(*pose_arrays([f.cam_from_world for f in result.frames]), *pose_arrays(poses))
     assert 3e-4 < errors.ate.max() < 0.0025  # of distances of up to 0.9
     assert result.parallax == pytest.approx(0.2, rel=0.15)
+    assert base.measured is not None
+    assert result.measured is None
+    lost = "The tracks of the shot are not kept: only the result without these images can be solved again."
+    assert result.notes.count(lost) == 1
+    further = add_images(result, [Frame(0, stills.images[3], "still 3")], source=tmp_path)
+    assert further.notes.count(lost) == 1
 
 
 # --- what cannot be added ---------------------------------------------------------------------------------------

@@ -1,5 +1,6 @@
 """A result solved again from its tracks: the same without changes, and without what is left out."""
 
+import json
 import zipfile
 from collections.abc import Iterator
 from dataclasses import replace
@@ -17,6 +18,7 @@ from factorsfm import (
     MaskRegion,
     Options,
     Reconstruction,
+    ReconstructionError,
     Stream,
     solve_again,
 )
@@ -198,6 +200,11 @@ def test_control_is_kept_until_there_is_another(result: Reconstruction, tmp_path
     [
         ({"without_tracks": [999999]}, "no track 999999 among the"),
         ({"without_tracks": ["door"]}, "no track door"),
+        ({"without_tracks": "12"}, "without_tracks is '12'; a list of numbers and names of tracks is expected"),
+        ({"without_tracks": 12}, "without_tracks is 12; a list of"),
+        ({"without_tracks": [1.5]}, r"without_tracks is \[1.5\]; a list of"),
+        ({"mask_regions": "0,0,9,9"}, "mask_regions is '0,0,9,9'; a list of regions is expected"),
+        ({"mask_regions": MaskRegion(0, 0, 9, 9)}, "a list of regions is expected"),
         ({"mask_regions": ["0,0,10"]}, '"0,0,10" is no region'),
         ({"mask_regions": ["0,0,10,0"]}, "is empty"),
         ({"mask_regions": ["5:3:0,0,9,9"]}, "empty"),
@@ -264,3 +271,20 @@ def test_the_command(result: Reconstruction, folder: Path, tmp_path: Path, capsy
     assert main(["solve", str(tmp_path / "mended"), "--output", str(tmp_path / "further")]) == 2
     assert_error(capsys.readouterr(), "keeps no tracks to solve again")
     assert not (tmp_path / "further").exists()
+
+
+def test_a_failure_says_why(result: Reconstruction, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    result.frames[0].thumbnail = thumbnail(np.full((90, 160, 3), 77, np.uint8))
+    result.write(tmp_path / "result")
+    command = ["solve", str(tmp_path / "result"), "--frames", "0:1", "--output", str(tmp_path / "failed")]
+    assert main(command) == 3
+    assert_error(capsys.readouterr(), "1 of 1 frames registered, at least 2 needed")
+    assert {path.name for path in (tmp_path / "failed").iterdir()} == {"summary.json", "report.html"}
+    summary = json.loads((tmp_path / "failed" / "summary.json").read_text())
+    assert "1 of 1 frames registered, at least 2 needed" in summary["reason"]
+    assert [status["index"] for status in summary["statuses"]] == [0]
+    assert summary["options"]["frames"] == "0:1"
+    assert (tmp_path / "failed" / "report.html").read_text().count("/9j/") == 1
+    with pytest.raises(ReconstructionError) as caught:
+        solve_again(result, frames=slice(3, 5))  # of which one repeats the other
+    assert [(frame.index, frame.repeats) for frame in caught.value.frames] == [(3, None), (4, 3)]

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 import re
 import shlex
 from collections.abc import Sequence
@@ -86,6 +87,17 @@ def test_keyframes_that_after_effects_copies(tmp_path: Path) -> None:
     assert not read_tracks(tmp_path / "ae.txt").from_bottom
 
 
+@pytest.mark.parametrize(("sizes", "expected"), [("\tSource Height\t1080\r\n", (1920, 1080)), ("", None)])
+def test_after_effects_says_the_size_of_the_footage_but_not_of_a_composition(
+    sizes: str, expected: tuple[int, int] | None, tmp_path: Path
+) -> None:
+    said = AFTER_EFFECTS.replace("\t1920\r\n", f"\t1920\r\n{sizes}")
+    (tmp_path / "ae.txt").write_bytes(said.encode())
+    assert read_tracks(tmp_path / "ae.txt").size == expected
+    (tmp_path / "ae.txt").write_bytes(said.replace("Feature Center", "Confidence").encode())
+    assert read_tracks(tmp_path / "ae.txt").size is None  # that of the layer whose position it is
+
+
 NUKE = """
 Read { name Read1 }
 Tracker4 {
@@ -118,6 +130,15 @@ def test_a_script_of_nuke(tmp_path: Path) -> None:
         ("hello world\n", "neither a table"),
         ("name,frame,x,y\na,1,2,3\n", "no column track"),
         ("track,frame,x,y\n", "there is no track"),
+        (
+            'track,frame,x,y\na,0,1,2\n"a,1,1,2\na,2,1,2\n',
+            "after line 2 a row does not end, as where a quote is",
+        ),
+        (
+            'track,frame,x,y\na,0,1,2\n"a,1,1,2\n' + 20000 * "a,2,1,2\n",
+            "after line 2 a row does not end, as where a quote",
+        ),
+        ('"track,frame,x,y\n' + 20000 * "a,2,1,2\n", "after line 0 a row does not end, as where a quote is not closed"),
         ("track,frame,x,y\na,1,2\n", "line 2 is '1', '2', None"),
         ("track,frame,x,y\na,1.5,2,3\n", "line 2 is '1.5'"),
         ("track,frame,x,y\na,1,2,nan\n", "is none"),
@@ -153,6 +174,11 @@ def test_files_that_cannot_be_read(text: str, words: str, tmp_path: Path) -> Non
         (lambda: UserTracks([a_track()], on="plate"), 'lie on "plate"'),
         (lambda: a_track(frames=[2, 1]), "do not ascend"),
         (lambda: a_track(frames=[1]), "of shape"),
+        (lambda: a_track(frames=[1, 2.5]), 'track "a" has a place or a frame that is none'),
+        (lambda: a_track(frames=[1, math.nan]), 'track "a" has a place or a frame that is none'),
+        (lambda: a_track(frames=["one", "two"]), 'track "a" has frames or places that are no numbers'),
+        (lambda: UserTrack("a", [0, 1], [[1.0, 2.0], [3.0]]), 'track "a" has frames or places that are no numbers'),
+        (lambda: UserTrack(7, [0], [[1.0, 2.0]]), "a track is called 7; a name in one line is expected"),
     ],
 )
 def test_tracks_that_are_none(tracks: Any, words: str) -> None:
@@ -160,7 +186,20 @@ def test_tracks_that_are_none(tracks: Any, words: str) -> None:
         tracks()
 
 
-def a_track(frames: Sequence[int] = (0, 1)) -> UserTrack:
+def test_lists_do_for_a_track() -> None:
+    track, same = UserTrack("a", [0, 1], [[10, 20], [11, 21]]), a_track()
+    for given, expected in ((track.frames, same.frames), (track.xy, same.xy)):
+        assert given.dtype == expected.dtype
+        np.testing.assert_array_equal(given, expected)
+
+
+def test_a_file_has_no_half_frames(tmp_path: Path) -> None:
+    (tmp_path / "tracks.csv").write_text("track,frame,x,y\na,1,2,3\n")
+    with pytest.raises(InputError, match=r"first_frame is 10\.5; a whole number is expected"):
+        read_tracks(tmp_path / "tracks.csv", first_frame=10.5)
+
+
+def a_track(frames: Sequence[Any] = (0, 1)) -> UserTrack:
     return UserTrack("a", np.array(frames), np.array([[10.0, 20.0], [11.0, 21.0]]))
 
 
@@ -304,6 +343,46 @@ def test_the_report_finds_the_wrong_ones_and_its_command_leaves_them_out(solved:
     assert read_result(f"{solved}-mended").notes == ["Solved again without 2 tracks: slides, slips."]
 
 
+@pytest.fixture(scope="module")
+def numbered(result: Reconstruction, tracks: UserTracks) -> tuple[Reconstruction, int]:
+    """Solved with a track that the user calls by the number of another one, and that number."""
+    number = int(result.track_ids[0]) + 1
+    own = UserTrack(str(number), tracks.tracks[0].frames, tracks.tracks[0].xy)
+    return solve_again(result, tracks=UserTracks([own], sigma=0.3)), number
+
+
+def test_a_name_comes_before_a_number(numbered: tuple[Reconstruction, int]) -> None:
+    solved, number = numbered
+    own, other = str(number), f"track_{number:05d}"
+    assert {own, other} < {*solved.track_names()}
+    for given, gone, stays in ((own, own, other), (other, other, own), (number, other, own)):
+        again = solve_again(solved, without_tracks=[given])
+        assert gone not in again.track_names()
+        assert stays in again.track_names()
+        assert again.notes[-1] == f"Solved again without 1 track: {gone}."
+        assert again.options["solved_again"][-1]["without_tracks"] == [str(given)]
+
+
+@pytest.mark.skipif(EXECUTABLE is None, reason=MISSING)
+@pytest.mark.parametrize("own", [True, False])
+def test_the_command_of_the_report_tells_a_number_from_a_name(
+    own: bool, numbered: tuple[Reconstruction, int], tmp_path: Path
+) -> None:
+    solved, number = numbered
+    row = solved.track_ids.tolist().index(number - 1)
+    solved.observation_error = np.where(solved.observation_point == row, 50.0, solved.observation_error)  # is listed
+    solved.write(tmp_path / "result")
+    browser = Chromium(tmp_path / "profile")
+    browser.open(tmp_path / "result" / "report.html")
+    name = str(number) if own else f"track_{number:05d}"
+    listed = f"[...byId('tracks_rows').rows].find(row => row.cells[1].textContent === '{name}')"
+    browser.run(f"{listed}.querySelector('input').click()")
+    command = shlex.split(browser.run("byId('mend_command').value"))
+    browser.close()
+    assert main(command[1:]) == 0
+    assert read_result(f"{tmp_path / 'result'}-mended").notes[-1] == f"Solved again without 1 track: {name}."
+
+
 def test_a_track_that_cannot_be_placed_is_named(result: Reconstruction, tracks: UserTracks) -> None:
     first, second = tracks.tracks[:2]
     once = UserTrack("window 9", np.array([0, 90, 91]), np.array([[5.0, 5.0]] * 3))
@@ -319,6 +398,45 @@ def test_a_track_that_cannot_be_placed_is_named(result: Reconstruction, tracks: 
     ]
     with pytest.raises(InputError, match="no track has two frames of the shot; its frames are 0 to 7"):
         solve_again(result, tracks=UserTracks([once, never]))
+
+
+def test_tracks_of_another_size_are_refused(result: Reconstruction, tracks: UserTracks, tmp_path: Path) -> None:
+    moving = tracks.tracks[0]
+    scaled = [UserTrack(track.name, track.frames, 2.0 * track.xy + 0.5) for track in tracks.tracks]
+    beyond = np.array([np.maximum(-0.5 - t.xy, t.xy - [319.5, 179.5]).max(axis=1) for t in scaled])
+    outside = int((beyond > 5.0).sum())
+    assert outside > 20
+    message = (
+        f"the tracks: {outside} of 64 places are outside of the footage of 320x180 pixels, by up to {beyond.max():.0f};"
+    )
+    with pytest.raises(InputError, match=message):
+        solve_again(result, tracks=UserTracks(scaled))
+    said = UserTracks([moving], size=(640, 360))
+    with pytest.raises(InputError, match="they are of an image of 640x360 pixels, the footage has 320x180"):
+        solve_again(result, tracks=said)
+    assert moving.name in solve_again(result, tracks=UserTracks([moving], size=(320, 180))).track_names()
+
+
+@pytest.mark.parametrize(("beyond", "leaving", "refused"), [(4.9, 8, False), (5.1, 2, False), (5.1, 3, True)])
+def test_tracks_may_leave_the_picture(beyond: float, leaving: int, refused: bool, result: Reconstruction) -> None:
+    xy = np.tile([100.0, 90.0], (FRAMES, 1))
+    xy[:leaving] = [319.5 + beyond, 90.0]
+    leaves = UserTracks([UserTrack("leaves", np.arange(FRAMES), xy)])
+    if refused:
+        with pytest.raises(InputError, match="3 of 8 places are outside of the footage of 320x180 pixels, by up to 5"):
+            solve_again(result, tracks=leaves)
+    else:
+        solve_again(result, tracks=leaves)
+
+
+@pytest.mark.parametrize("said", [["--tracks-sigma", "0.3"], ["--tracks-on", "footage"], ["--tracks-first-frame", "0"]])
+def test_what_is_said_of_tracks_needs_them(
+    said: list[str], solved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for command in (["solve", str(solved)], ["reconstruct", str(tmp_path)]):
+        assert main([*command, *said, "--output", str(tmp_path / "out")]) == 2
+        assert_error(capsys.readouterr(), f"{said[0]} needs --tracks FILE")
+    assert not (tmp_path / "out").exists()
 
 
 def test_reconstruct_takes_them(tracks: UserTracks, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
