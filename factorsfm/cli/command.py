@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
@@ -14,10 +16,10 @@ from factorsfm.frames.fields import Fields
 from factorsfm.frames.ranges import parse_range
 from factorsfm.mending.user_tracks import DEFAULT_SIGMA_PX, Plate, UserTracks, read_tracks
 from factorsfm.priors.depth_map import DepthKind
-from factorsfm.report.result_folder import write_folder
+from factorsfm.report.result_folder import write_failure, write_folder
 from factorsfm.result.reconstruction import Reconstruction
 from factorsfm.result.summary import conclusion
-from factorsfm.support.errors import InputError
+from factorsfm.support.errors import InputError, ReconstructionError
 from factorsfm.support.options import PRESETS, LensFreedom, ShutterUse
 from factorsfm.support.progress import Progress
 
@@ -224,6 +226,17 @@ def unless_none(text: str | None) -> str | None:
 def as_given(arguments: argparse.Namespace) -> dict[str, Any]:
     """The arguments as options of a failed result."""
     return {name: value for name, value in vars(arguments).items() if name not in ("command", "output", "verbose")}
+
+
+@contextmanager
+def failure_kept(output: Path, options: Mapping[str, Any]) -> Iterator[None]:
+    """Write the reason, with options, into the output folder where a shot cannot be reconstructed in the block."""
+    begin = time.perf_counter()
+    try:
+        yield
+    except ReconstructionError as error:
+        write_failure(output, str(error), error.frames, options, {"total": time.perf_counter() - begin})
+        raise
 
 
 def write_result(reconstruction: Reconstruction, output: Path, progress: Progress) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import time
 from pathlib import Path
 
 from factorsfm import api
@@ -20,6 +19,7 @@ from factorsfm.cli.command import (
     add_range,
     add_tracks,
     as_given,
+    failure_kept,
     range_of,
     tracks_of,
     unless_none,
@@ -27,8 +27,8 @@ from factorsfm.cli.command import (
 )
 from factorsfm.cli.progress_line import ProgressLine
 from factorsfm.frames.numbering import first_number_of
-from factorsfm.report.result_folder import check_directory, write_failure
-from factorsfm.support.errors import InputError, ReconstructionError
+from factorsfm.report.result_folder import check_directory
+from factorsfm.support.errors import InputError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -76,8 +76,7 @@ def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
         raise InputError("--align and --control are given; a result in the world of its control is not aligned")
     camera, frames = open_camera(arguments.camera), range_of(arguments)
     tracks = tracks_of(arguments, first_number_of(arguments.source))
-    begin = time.perf_counter()
-    try:
+    with failure_kept(arguments.output, as_given(arguments)):
         reconstruction = api.reconstruct(
             arguments.source,
             camera=camera,
@@ -99,10 +98,6 @@ def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
             imu=arguments.imu,
             progress=progress,
         )
-    except ReconstructionError as error:
-        seconds = {"total": time.perf_counter() - begin}
-        write_failure(arguments.output, str(error), error.frames, as_given(arguments), seconds)
-        raise
     if arguments.align:
         reconstruction = align(reconstruction)
     return write_result(reconstruction, arguments.output, progress)

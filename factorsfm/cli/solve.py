@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import time
 from pathlib import Path
 
 from factorsfm.cli.command import (
@@ -12,14 +11,15 @@ from factorsfm.cli.command import (
     add_range,
     add_tracks,
     as_given,
+    failure_kept,
     range_of,
     tracks_of,
     write_result,
 )
 from factorsfm.cli.progress_line import ProgressLine
 from factorsfm.mending.solve_again import read_with_pictures, solve_again
-from factorsfm.report.result_folder import check_directory, write_failure
-from factorsfm.support.errors import InputError, ReconstructionError
+from factorsfm.report.result_folder import check_directory
+from factorsfm.support.errors import InputError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -57,8 +57,7 @@ def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
         raise InputError("the output folder is that of the result, which keeps what is left out; choose another one")
     known = read_with_pictures(arguments.result)
     tracks = tracks_of(arguments, known.options.get("first_number"))
-    begin = time.perf_counter()
-    try:
+    with failure_kept(arguments.output, {"source": known.options.get("source")} | as_given(arguments)):
         solved = solve_again(
             known,
             without_tracks=arguments.without_tracks,
@@ -68,10 +67,6 @@ def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
             tracks=tracks,
             progress=progress,
         )
-    except ReconstructionError as error:
-        said, seconds = {"source": known.options.get("source")} | as_given(arguments), time.perf_counter() - begin
-        write_failure(arguments.output, str(error), error.frames, said, {"total": seconds})
-        raise
     return write_result(solved, arguments.output, progress)
 
 

@@ -19,7 +19,7 @@ from factorsfm.adjustment.state import State
 from factorsfm.graph.window import Window
 from factorsfm.mapping.group_readings import from_group
 from factorsfm.mapping.map_copy import MapCopy
-from factorsfm.mapping.mapped_images import MappedImage
+from factorsfm.mapping.mapped_images import MappedImage, state_of
 from factorsfm.mapping.registration import register_image
 from factorsfm.mapping.starts import lift
 from factorsfm.motion.at_rest import image_weights
@@ -47,8 +47,8 @@ def scene_alone(copy: MapCopy, images: list[MappedImage], window: Window, ids: I
     Args:
         window: as the graph has solved it; ids: all mapped tracks, those of the window among them.
     """
-    young = _LEAST_KEYFRAMES <= len(copy.keyframes) <= YOUNG_KEYFRAMES
-    if not young or typical_error(window) < _FITS * copy.options.pixel_sigma:
+    few = len(copy.keyframes) < _LEAST_KEYFRAMES
+    if few or typical_error(window) < _FITS * copy.options.pixel_sigma:
         return window.ids
     found = another_reading(copy, images, window, ids)
     return window.ids if found is None else ids[found.kept]
@@ -63,9 +63,7 @@ def another_reading(copy: MapCopy, images: list[MappedImage], window: Window, id
     seen = gather([image.tracks for image in images], ids, copy.focal)
     points = copy.points.at(ids)
     points[np.isin(ids, window.ids)] = window.points
-    distance = np.linalg.norm(points, axis=1)
-    inverse = 1.0 / distance
-    state = State(window.rotation, window.translation, points * inverse[:, None], inverse, np.log([copy.focal]))
+    state = replace(state_of(images, points, copy.focal), rotation=window.rotation, translation=window.translation)
     readings = [Reading(np.arange(len(ids)), solution_from(state, seen, READING))]
     for group in turning_groups(seen, state.normalized(seen), copy.focal):
         if len(np.unique(seen.of(np.flatnonzero(group)).frame)) == len(images):

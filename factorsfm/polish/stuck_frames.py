@@ -38,9 +38,11 @@ def freed(solved: BundleAdjustment, times: Index, options: Options) -> BundleAdj
     state, o = solved.state, solved.observations
     beside = _beside_the_path(state, times)
     on_path = np.setdiff1d(np.arange(len(times)), beside)
+    if not len(beside) or not len(on_path):
+        return solved
     rotation, translation, sigma = state.rotation.copy(), state.translation.copy(), max(solved.sigma, SMALLEST_SIGMA_PX)
     by_frame, xy, moved = o.rows_by_frame(len(times)), state.normalized(o), []
-    for row in beside.tolist() if len(on_path) else []:
+    for row in beside.tolist():
         mine, focal = by_frame[row], float(state.focal[row])
         if row == state.world or len(mine) < options.mapper.min_inliers:
             continue
@@ -76,5 +78,5 @@ def _beside_the_path(state: State, times: Index) -> Index:
 
 
 def _cost(errors: Array, kernel: float) -> float:
-    """Robust cost of errors in standard deviations; infinite behind the camera."""
+    """Robust cost of errors in standard deviations; those behind the camera are infinite, and cost much."""
     return float(cauchy(np.minimum(errors, 1e6)[:, None], kernel)[0].sum())
