@@ -17,13 +17,14 @@ import json
 import multiprocessing
 import sys
 import threading
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 from itertools import islice
+from multiprocessing.connection import Connection
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, TypeVar
 from unittest.mock import patch
 
 import numpy as np
@@ -48,9 +49,11 @@ ROOMS = (
 )  # fmt: skip
 FACTORS = (0.7, 1.4)
 MUCH, LITTLE = 3.0, 0.5  # points of a column
+_SECONDS = 300  # of a measurement, twenty times as long as it takes
 COLUMNS = (("ATE", 0.002), ("ATE", 0.02), ("T-RPE", 0.001), ("T-RPE", 0.005), ("R-RPE", 0.02), ("R-RPE", 0.1))
 
 Scores = dict[str, list[float]]
+_Found = TypeVar("_Found")
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,6 +199,27 @@ def _errors(name: str, data: Path, options: Options) -> dict[str, Any]:
     return {kind: trajectory_errors(*pose_arrays(found), *true) for kind, found in poses.items()}
 
 
+def apart(work: Callable[..., _Found], *arguments: object) -> _Found | None:
+    """What a function gives in a process of its own; None where it fails, or does not end: solvers may not converge."""
+    spawn = multiprocessing.get_context("spawn")
+    receiver, sender = spawn.Pipe(duplex=False)
+    process = spawn.Process(target=_send, args=(sender, work, arguments))
+    process.start()
+    sender.close()
+    try:
+        found: _Found | None = receiver.recv() if receiver.poll(_SECONDS) else None
+    except EOFError:
+        found = None
+    finally:
+        process.kill()
+        process.join()
+    return found
+
+
+def _send(sender: Connection, work: Callable[..., object], arguments: Sequence[object]) -> None:
+    sender.send(work(*arguments))
+
+
 def report(records: dict[str, Scores], shots: tuple[str, ...], rooms: Sequence[str]) -> str:
     """The constants that matter, the worst first, and how many do not."""
     base = records["unchanged"]
@@ -239,26 +263,21 @@ def main() -> None:
     arguments = parser.parse_args()
     kept, shots = arguments.output / "sensitivity.json", tuple(arguments.shots)
     records: dict[str, Scores] = json.loads(kept.read_text()) if kept.exists() else {}
-    spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(arguments.jobs, spawn, max_tasks_per_child=1) as pool:
-        met = pool.submit(names_run, arguments.data, shots).result()
-        plan: dict[str, tuple[Constant | None, float]] = {"unchanged": (None, 1.0)}
-        for constant in (c for room in arguments.rooms for c in constants(room) if c.name in met):
-            if arguments.only in constant.key:
-                plan |= {f"{constant.key} {factor:g}": (constant, factor) for factor in FACTORS}
+    met = apart(names_run, arguments.data, shots)
+    if met is None:
+        sys.exit("the measurement fails without any change; see above")
+    plan: dict[str, tuple[Constant | None, float]] = {"unchanged": (None, 1.0)}
+    for constant in (c for room in arguments.rooms for c in constants(room) if c.name in met):
+        if arguments.only in constant.key:
+            plan |= {f"{constant.key} {factor:g}": (constant, factor) for factor in FACTORS}
+    with ThreadPoolExecutor(arguments.jobs) as pool:
         jobs = {
-            key: pool.submit(measure, constant, factor, arguments.data, shots)
+            key: pool.submit(apart, measure, constant, factor, arguments.data, shots)
             for key, (constant, factor) in plan.items()
             if key not in records
         }
         for key, job in jobs.items():
-            try:
-                records[key] = job.result()
-            except Exception as error:  # a constant that the product cannot do with
-                if key == "unchanged":
-                    raise
-                print(key, error, flush=True)
-                records[key] = {}
+            records[key] = job.result() or {}  # nothing: the product cannot do with that value
             kept.write_text(json.dumps(records, indent=1))
             print(key, records[key], flush=True)
     text = report({key: records[key] for key in plan}, shots, arguments.rooms)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.gather import gather
+from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import ErrorModel, Free
 from factorsfm.mapping.depth_fallback import DepthGuidance
 from factorsfm.mapping.incremental import add_points, triangulate_tracks
@@ -95,15 +96,34 @@ def agreeing_tracks(
     Returns:
         The ids (m,) of those of them that enough of the images see, and whether they agree.
     """
+    judged, observations, errors, suspected = errors_on_map(images, points, suspects, focal, options)
+    if not suspected.any() or suspected.all():
+        return judged, np.zeros(len(judged), bool)
+    return judged, agreeing(observations, errors, suspected)[suspected]
+
+
+def errors_on_map(
+    images: Sequence[MappedImage], points: PointMap, suspects: Index, focal: float, options: MapperOptions
+) -> tuple[Index, Observations, Array, NDArray[np.bool_]]:
+    """Errors of the mapped tracks and of suspected ones, which get points under the poses of some registered images.
+
+    Args:
+        suspects: (n,) ids, ascending; focal: pixels.
+
+    Returns:
+        The ids (k,) of those suspects that enough of the images see, the observations (m,) of them and of the map,
+        their reprojection errors in pixels, and which of the points are suspects; without errors where either is none.
+    """
     seen = [image.tracks for image in images]
     judged = np.intersect1d(seen_by(seen, _JUDGED_VIEWS), suspects)
     scene = np.setdiff1d(seen_by(seen, 2), suspects)
     scene = scene[points.contains(scene)]
-    if not len(judged) or not len(scene):
-        return judged, np.zeros(len(judged), bool)
     ids = np.union1d(scene, judged)
     suspected = np.isin(ids, judged)
-    observations, cameras = gather(seen, ids, focal), state_of(images, points.at(scene), focal)
+    observations = gather(seen, ids, focal)
+    if not len(judged) or not len(scene):
+        return judged, observations, np.zeros(0), suspected
+    cameras = state_of(images, points.at(scene), focal)
     bearing, inverse = np.empty((len(ids), 3)), np.empty(len(ids))
     bearing[~suspected], inverse[~suspected] = cameras.bearing, cameras.inverse_distance
     found = triangulate(
@@ -113,7 +133,7 @@ def agreeing_tracks(
     bearing[suspected], inverse[suspected] = found.bearing, found.inverse_distance
     state = replace(cameras, bearing=bearing, inverse_distance=inverse)
     errors = BundleAdjustment(state, observations, _SOLVER, ErrorModel(options.pixel_sigma)).reprojection_errors()
-    return judged, agreeing(observations, errors, suspected)[suspected]
+    return judged, observations, errors, suspected
 
 
 def _add_points(

@@ -31,6 +31,7 @@ class MapUpdate:
         focal: a better focal length (pixels), None where it stays as it is.
         burn_ins: tracks of what is laid over the images.
         moving: how many tracks move by themselves, so that the map begins again without them.
+        at_odds: see `share_at_odds`; None where it was not asked.
         begins_again: whether it does, without those or, while it is young, without burn-ins: poses before are as wrong
             as it was.
         mirrored: see `UpdateResult`.
@@ -53,6 +54,7 @@ class MapUpdate:
     focal: float | None = None
     burn_ins: Index = field(default_factory=lambda: np.zeros(0, np.int64))
     moving: int = 0
+    at_odds: float | None = None
     begins_again: bool = False
     mirrored: bool = False
     no_prior: bool = False

@@ -16,6 +16,7 @@ from factorsfm.graph.contents import LiveGraph, graph_contents
 from factorsfm.graph.process import GraphProcess
 from factorsfm.graph.unit_of_length import unit_of_length
 from factorsfm.mapping.additions import Additions
+from factorsfm.mapping.at_odds import became_much
 from factorsfm.mapping.graph_updates import submit_update
 from factorsfm.mapping.incremental import IncrementalMapper
 from factorsfm.mapping.keyframes import carry, is_keyframe, suddenly_rough, update_delay
@@ -28,7 +29,7 @@ from factorsfm.mapping.mapped_images import MappedImage, nearest_registered
 from factorsfm.mapping.point_map import PointMap
 from factorsfm.mapping.prior_trust import PriorTrust
 from factorsfm.mapping.registration import Registration
-from factorsfm.mapping.starter import NOT_JOINED, Starter, passed_by
+from factorsfm.mapping.starter import NOT_JOINED, Starter, left_behind, passed_by
 from factorsfm.mapping.starts import NoStart, Start
 from factorsfm.mapping.young_map import YOUNG_KEYFRAMES
 from factorsfm.priors.image_depth import ImageDepth
@@ -43,7 +44,7 @@ Index = NDArray[np.int64]
 
 logger = logging.getLogger(__name__)
 
-_STATE = ("focal", "first_focal", "keyframes", "new_points", "parallax", "started", "unit", "_due")
+_STATE = ("focal", "first_focal", "keyframes", "new_points", "parallax", "started", "unit", "at_odds", "_due")
 _RUNNING_OUT = 0.45  # share of an image's tracks with a point, below which the map is extended at once
 
 
@@ -63,7 +64,7 @@ class Mapper(IncrementalMapper):
         self.keyframes: list[int] = []
         self.burn_ins = np.zeros(0, np.int64)  # tracks that the last image showed to be laid over the image
         self.new_points = 0  # that came with the last image
-        self.parallax = 0.0  # largest so far
+        self.parallax, self.at_odds = 0.0, 0.0  # largest so far; see `share_at_odds`
         self.note = ""  # what became of the map with the last image, where that is out of the ordinary
         self.unit = 1.0  # how many times as long lengths are as when the map began
         self.additions = Additions()
@@ -266,18 +267,12 @@ class Mapper(IncrementalMapper):
     def _start_anew(self) -> None:
         """Forget the map; the images that did not join it wait for another."""
         self._take_over()
-        joined = sum(image.registered for image in self.images)
-        last = max(k for k, image in enumerate(self.images) if image.registered)
-        for k, image in enumerate(self.images):
-            if k > last and image.status in NOT_JOINED:
-                image.forget(FrameStatus.WAITING, "waiting for the start of another map")
-            elif image.registered:
-                image.forget(FrameStatus.LOST, f"on a map of {joined} images that none of those that followed joined")
-        self._give_up_map(f"the images that follow image {last} do not join its map, starting anew")
+        self._give_up_map(left_behind(self.images))
 
     def _give_up_map(self, reason: str) -> None:
         self._graph.start_anew()
-        self.points, self.keyframes, self.parallax, self.started = PointMap(), [], 0.0, False
+        self.points, self.keyframes, self.started = PointMap(), [], False
+        self.parallax, self.at_odds = 0.0, 0.0
         if self.additions.taken or self.additions.offered:
             reason += "; the factors added are given up with it"
         self.additions, self.unit = Additions(), 1.0
@@ -363,7 +358,10 @@ class Mapper(IncrementalMapper):
             image.keyframe = False
             return
         self.keyframes.append(update.position)
-        self.note = self.additions.follow(update) or update.note or self.note
+        at_odds = self.at_odds if update.at_odds is None else update.at_odds
+        said = self.note, self.additions.follow(update) or update.note, became_much(self.at_odds, at_odds)
+        self.at_odds = at_odds
+        self.note = "; ".join(filter(None, said))
         self.begins_again |= update.begins_again
         if update.unit != 1.0:
             self._rescale(update.unit)

@@ -94,3 +94,19 @@ def passed_by(images: Sequence[MappedImage], keyframes: int, min_tracks: int) ->
     if not barely_started or len(failed) <= max(_PATIENCE, joined):
         return False
     return shared_tracks(failed[0], failed[_PATIENCE]) >= min_tracks
+
+
+def left_behind(images: Sequence[MappedImage]) -> str:
+    """Let the images that did not join their map wait for another, and those that did lose it; says why.
+
+    Args:
+        images: in order of time.
+    """
+    joined = sum(image.registered for image in images)
+    last = max(k for k, image in enumerate(images) if image.registered)
+    for k, image in enumerate(images):
+        if k > last and image.status in NOT_JOINED:
+            image.forget(FrameStatus.WAITING, "waiting for the start of another map")
+        elif image.registered:
+            image.forget(FrameStatus.LOST, f"on a map of {joined} images that none of those that followed joined")
+    return f"the images that follow image {last} do not join its map, starting anew"

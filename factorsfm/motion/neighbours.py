@@ -11,6 +11,7 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 _NEIGHBOURS = 10  # points, with the one that is judged
+_ACROSS, _DOWN = 32, 18  # places of the image, each of which is what the point nearest to it is
 _REACH, _FRAMES = 8, 16  # a step of an eighth of the image leads as far away as one of so many frames
 
 
@@ -35,3 +36,15 @@ def share_nearby(among: Array, flags: Flags, judged: Flags | None = None) -> Arr
         for place in (among if judged is None else among[judged])
     ]
     return np.array(found) / (count + 1)
+
+
+def share_of_image(xy: Array, flags: Flags, size: tuple[int, int]) -> float:
+    """Share of the places of an image to which the nearest point is one with a flag.
+
+    Args:
+        xy: (n, 2) pixels; flags: (n,); size: width and height.
+    """
+    v, u = np.divmod(np.arange(_ACROSS * _DOWN), _ACROSS)
+    places = (np.column_stack([u, v]) + 0.5) * np.array(size) / [_ACROSS, _DOWN] - 0.5
+    away = (xy**2).sum(axis=1) - 2.0 * places @ xy.T  # squared distance, but for what is the same for all points
+    return float(flags[np.argmin(away, axis=1)].mean())

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.motion.neighbours import share_of_image
 from factorsfm.result.runs import runs
 from factorsfm.support.errors import InputError
 from factorsfm.support.json_reading import read_json, typed
@@ -18,7 +19,6 @@ from factorsfm.tracks.image_tracks import ImageTracks
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-_ACROSS, _DOWN = 32, 18  # places of the image that belong to what moves if the track nearest to them does
 # Of the image, from which a frame belongs to a stretch: tracks beside the rim of the image and in reflections stand out
 # together now and then, on 1 % of it.
 _LEAST_IMAGE = 0.02
@@ -75,7 +75,7 @@ def moving_in(images: Sequence[ImageTracks], indices: Sequence[int], judged: Ind
         ids, xy = tracks.ids[known], tracks.pixels[known]
         moves = np.isin(ids, moving)
         if moves.any():
-            shares[row] = moves.mean(), _share_of_image(xy, moves, (tracks.camera.width, tracks.camera.height))
+            shares[row] = moves.mean(), share_of_image(xy, moves, (tracks.camera.width, tracks.camera.height))
             seen.append((np.full(moves.sum(), index), ids[moves], xy[moves]))
     found = tuple(
         MovingStretch(int(indices[part.start]), int(indices[part.stop - 1]), *shares[part].mean(axis=0).tolist())
@@ -85,14 +85,6 @@ def moving_in(images: Sequence[ImageTracks], indices: Sequence[int], judged: Ind
         return None
     frame, track, xy = (np.concatenate(parts) for parts in zip(*seen, strict=True))
     return Moving(found, frame, np.unique(track, return_inverse=True)[1], xy)
-
-
-def _share_of_image(xy: Array, moves: NDArray[np.bool_], size: tuple[int, int]) -> float:
-    """Share of the places of an image to which the nearest track is one that moves."""
-    v, u = np.divmod(np.arange(_ACROSS * _DOWN), _ACROSS)
-    places = (np.column_stack([u, v]) + 0.5) * np.array(size) / [_ACROSS, _DOWN] - 0.5
-    away = (xy**2).sum(axis=1) - 2.0 * places @ xy.T  # squared distance, but for what is the same for all tracks
-    return float(moves[np.argmin(away, axis=1)].mean())
 
 
 # --- moving.json ----------------------------------------------------------------------------------------------------

@@ -52,14 +52,16 @@ class FrameUpdate:
         parallax: largest camera displacement so far over the median depth of the points seen.
         covariance: (6, 6) of the pose (see `FrameResult`), the uncertainty of the map included; None without a pose.
         prior: the newest depth map that the graph has used, None as long as there is none.
+        at_odds: share of the image that no point of the map explains, as it was asked last: it moves by itself, or,
+            where it is much (a quarter or more; `note` says so), it is the scene and the map is of what moves.
         dropped: frames that a live source dropped right before this one.
         shot: number of the shot in an `Episode`.
         focal_length: pixels, as the stream has it now; focal_changed: whether this frame changed it.
         starts_anew: whether all poses that were given before are void: with this frame the map was given up, or began
             again without what had bent it while it was young. `note` says why.
         note: one sentence on what became of the map with this frame, where that is out of the ordinary: a start that
-            was given up or begins again without what moves by itself, a depth prior without which the stream goes on;
-            else empty.
+            was given up or begins again without what moves by itself, a depth prior without which the stream goes on,
+            much that is at odds with the map; else empty.
         repeats: index of the frame whose image this one shows once more, and whose pose it has; None if it is new.
     """
 
@@ -74,6 +76,7 @@ class FrameUpdate:
     parallax: float = 0.0
     covariance: NDArray[np.float64] | None = None
     prior: KeyframePrior | None = None
+    at_odds: float = 0.0
     dropped: int = 0
     shot: int = 0
     focal_length: float = float("nan")
@@ -117,7 +120,7 @@ def frame_update(
     return FrameUpdate(
         frame.index, image.status, image.message, pose_of(image), image.keyframe, len(image.tracks.ids),
         image.inliers, mapper.new_points, mapper.parallax, image.covariance, _newest_prior(mapper, frames),
-        frame.dropped, focal_length=mapper.focal, focal_changed=focal_changed,
+        mapper.at_odds, frame.dropped, focal_length=mapper.focal, focal_changed=focal_changed,
         starts_anew=mapper.starts_anew or mapper.begins_again, note=mapper.note,
     )  # fmt: skip
 

@@ -111,5 +111,7 @@ def test_a_map_that_changes_its_mind_says_that_the_poses_before_are_void():
     mapper.close()
     first = next(update for update in updates if update.starts_anew)
     assert first.index == 6
-    assert first.note == "120 tracks move by themselves, the map begins again without them"
+    again, at_odds = first.note.split("; ")
+    assert again == "120 tracks move by themselves, the map begins again without them"
+    assert at_odds.startswith("49% of the image is at odds with the map")
     assert all(update.starts_anew == bool(update.note) for update in updates)

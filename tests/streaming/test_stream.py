@@ -24,7 +24,7 @@ from factorsfm import (
 from factorsfm.camera.projection import pixels_from_normalized
 from factorsfm.evaluation.useless_priors import RandomSmoothPrior
 from factorsfm.mapping.mapper import Mapper
-from factorsfm.synthetic import render_shot, simulate_prior
+from factorsfm.synthetic import render_moving, render_shot, simulate_prior
 from tests.left_alive import children
 from tests.rendered import FRAMES, Maps, errors_of, quick_presets, rendered, simulated_maps, with_fewer_tracks
 
@@ -385,3 +385,12 @@ def test_a_graph_whose_process_is_killed_comes_back(run, caplog):
     assert 0.0008 < np.median(errors_of(result, rendered("dolly")).ate) < 0.005
     undisturbed = sum(u.keyframe for u in run[0])
     assert undisturbed - len(caplog.messages) <= sum(f.keyframe for f in result.frames) <= undisturbed
+
+
+def test_what_moves_beside_the_map_is_counted_and_said_while_it_goes_on():
+    moving = render_moving("truck", 24, 400, 225, parallax=0.05, size=0.85)
+    with Stream(moving.shot.camera) as stream:
+        updates = [stream.push(image) for image in moving.shot.images]
+    assert 0.25 < updates[-1].at_odds < 0.45  # the box covers 39 % of the last frame
+    notes = [update.note for update in updates if "at odds with the map" in update.note]
+    assert len(notes) == 1
