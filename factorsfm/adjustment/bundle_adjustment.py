@@ -16,7 +16,7 @@ from factorsfm.adjustment.depth_term import AffinePrior, DepthTerm
 from factorsfm.adjustment.elimination import Block, Elimination, Normal, Term, reduced
 from factorsfm.adjustment.left_out import LeftOut
 from factorsfm.adjustment.marginals import Marginals, tangent_basis
-from factorsfm.adjustment.noise import block_inflation
+from factorsfm.adjustment.noise import block_inflation, shared_sigma
 from factorsfm.adjustment.observations import Observations, PriorObservations
 from factorsfm.adjustment.problem import NOTHING, POSES, CameraTerm, ErrorModel, Free, Known
 from factorsfm.adjustment.residuals import cauchy
@@ -121,8 +121,15 @@ class BundleAdjustment:
 
     def error_inflation(self) -> float:
         """Factor on the variance because the errors of neighbouring tracks are correlated, see `block_inflation`."""
+        return block_inflation(*self._errors_in_place())
+
+    def shared_error(self) -> float:
+        """Part of an error that neighbouring tracks have in common (standard deviation of a coordinate, pixels)."""
+        return shared_sigma(*self._errors_in_place())
+
+    def _errors_in_place(self) -> tuple[Array, Index, Array]:
         place = self.state.normalized(self.observations)
-        return block_inflation(self.reprojection_vectors(), self.observations.frame, place)
+        return self.reprojection_vectors(), self.observations.frame, place
 
     def observation_sigmas(self) -> tuple[Array, Array]:
         """(m,) standard deviations that the observations have at their present weights, and (n,) of the error that

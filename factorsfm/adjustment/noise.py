@@ -34,13 +34,31 @@ def block_inflation(residual: Array, frame: NDArray[np.int64], place: Array) -> 
     Args:
         residual: (m, 2) predicted minus observed position; frame: (m,) in which; place: (m, 2) normalised coordinates.
     """
+    of_sums, power, _ = _block_powers(residual, frame, place)
+    return max(1.0, of_sums / max(power, 1e-12))
+
+
+def shared_sigma(residual: Array, frame: NDArray[np.int64], place: Array) -> float:
+    """Standard deviation of the part of an error that the neighbours have, too; in the unit of the residuals.
+
+    From all pairs of a block: unlike `block_inflation`, it does not grow with the number of observations in a block.
+
+    Args:
+        residual, frame, place: see `block_inflation`.
+    """
+    of_sums, power, pairs = _block_powers(residual, frame, place)
+    return float(np.sqrt(max(of_sums - power, 0.0) / max(2 * pairs, 1)))  # two coordinates
+
+
+def _block_powers(residual: Array, frame: NDArray[np.int64], place: Array) -> tuple[float, float, int]:
+    """Power of the sums of the inliers in all blocks, of the inliers one by one, and number of pairs within blocks."""
     inlier = _inliers(residual)
     across, down, frames = _BLOCKS
     key = (frame // frames) * down * across + image_cells(place, across, down)
     key, residual = key[inlier], residual[inlier]
     sums = [np.bincount(key, residual[:, axis]) for axis in range(2)]
-    power = float((residual**2).sum())
-    return max(1.0, float((sums[0] ** 2 + sums[1] ** 2).sum()) / max(power, 1e-12))
+    count = np.bincount(key)
+    return float((sums[0] ** 2 + sums[1] ** 2).sum()), float((residual**2).sum()), int((count * (count - 1)).sum())
 
 
 def image_cells(xy: Array, across: int, down: int) -> NDArray[np.int64]:

@@ -185,7 +185,8 @@ def _solved(
         camera_observability(adjustment, marginals, covariance), point_std,
         left_out, prior, start.core.lens, start.core.shutter, moving=start.moving, turns=start.core.turns,
         rest=start.core.rest, rival=start.core.rival, zoom=start.core.zoom,
-        inflation=start.inflation, contradiction=start.depths.correlation,
+        inflation=start.inflation, shared_error=start.core.adjustment.shared_error(),
+        contradiction=start.depths.correlation,
     )  # fmt: skip
     if shot.in_time:
         result.stretches = _stretches(start.core, frames, options)

@@ -52,7 +52,8 @@ class Polished:
             where nothing else may be.
         stretches: by positions of the images, in order of time; empty where they are in no order.
         zoom: longest over shortest focal length of a zoom that the tracks ask for and that is not estimated; 0: none.
-        inflation: of the variance of the core tracks, since errors of neighbours are alike, see `error_inflation`.
+        inflation: of the variance of the core tracks, since errors of neighbours are alike, see `error_inflation`;
+            shared_error: pixels that they have in common.
         contradiction: see `NearAndFar.correlation`.
         world_alignment: from this world to that of the control; control: its residuals. None without control.
         factors: of the caller, that took part.
@@ -86,6 +87,7 @@ class Polished:
     zoom: float = 0.0
     stretches: tuple[Stretch, ...] = ()
     inflation: float = 1.0
+    shared_error: float = 0.0
     contradiction: float | None = None
     world_alignment: Similarity | None = None
     control: ControlFit | None = None
