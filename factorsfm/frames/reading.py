@@ -15,7 +15,7 @@ from factorsfm.frames.aspect import check_pixel_aspect
 from factorsfm.frames.fields import Fields
 from factorsfm.frames.folders import IMAGE_SUFFIXES, read_image, stated_pixel_aspect
 from factorsfm.frames.frame import Frame, bgr_image
-from factorsfm.frames.numbering import chosen, numbered_images
+from factorsfm.frames.numbering import FrameFile, chosen, numbered_images
 from factorsfm.frames.ranges import checked_range
 from factorsfm.frames.video import decode, open_video
 from factorsfm.support.errors import InputError
@@ -130,6 +130,6 @@ def _array_frames(
             yield Frame(index, bgr_image(image, index), f"{index:06d}")
 
 
-def _folder_frames(images: list[tuple[int, Path]]) -> Iterator[Frame]:
-    for number, path in images:
-        yield Frame(number, read_image(path), path.name, path=path, pixel_aspect=stated_pixel_aspect(path))
+def _folder_frames(images: list[FrameFile]) -> Iterator[Frame]:
+    for number, path, time in images:
+        yield Frame(number, read_image(path), path.name, time, path=path, pixel_aspect=stated_pixel_aspect(path))
