@@ -12,12 +12,15 @@ from numpy.typing import NDArray
 
 from factorsfm.frames.image_damage import damage_of, without_padding
 from factorsfm.frames.plates import PLATE_SUFFIXES, Pixels, plate_pixel_aspect, read_dpx, read_exr
-from factorsfm.frames.silence import held_back, quiet_opencv
+from factorsfm.frames.silence import held_back, opencv_errors, quiet_opencv
 from factorsfm.frames.tone import eight_bits
 from factorsfm.support.errors import InputError
 from factorsfm.support.json_text import is_text
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}) | PLATE_SUFFIXES
+_COLOR = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
+_TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_TIFF_DAMAGE = re.compile("TIFF_Error (ZIPDecode|PackBitsDecode|Using code not yet|.*(Not enough data|Corrupted))")
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -78,7 +81,7 @@ def read_pixels(path: Path) -> Pixels:
     try:
         if damage == "doubtful" and all(map(_libjpeg_complains, (data, without_padding(data)))):
             raise InputError(f"image {path} is damaged")
-        image = _decoded(data)
+        image = _decoded_tiff(data, path) if data.startswith(_TIFF_STARTS) else _decoded(data)
     except cv2.error as error:
         raise InputError(f"image {path} cannot be decoded; it has too many pixels or is damaged") from error
     if image is None:
@@ -90,8 +93,16 @@ def read_pixels(path: Path) -> Pixels:
 
 def _decoded(data: bytes) -> NDArray[np.generic] | None:
     with quiet_opencv():
-        color = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
-        return cv2.imdecode(np.frombuffer(data, np.uint8), color) if data else None
+        return cv2.imdecode(np.frombuffer(data, np.uint8), _COLOR) if data else None
+
+
+def _decoded_tiff(data: bytes, path: Path) -> NDArray[np.generic] | None:
+    """OpenCV leaves parts black that cannot be decoded, and says so in its log alone."""
+    with opencv_errors() as said:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), _COLOR)
+    if _TIFF_DAMAGE.search(said.errors):
+        raise InputError(f"image {path} is damaged or truncated")
+    return image
 
 
 def _libjpeg_complains(data: bytes) -> bool:

@@ -18,6 +18,7 @@ from factorsfm.frames.frame import Frame
 from factorsfm.frames.ranges import parse_range
 from factorsfm.frames.reading import read_frames
 from factorsfm.frames.silence import quiet_opencv
+from factorsfm.frames.tone import eight_bits
 from factorsfm.support.errors import InputError
 
 RNG = np.random.default_rng(0)
@@ -387,6 +388,39 @@ def test_a_marker_that_no_scan_holds_is_damage(tmp_path):
     (tmp_path / "a.jpg").write_bytes(data[:middle] + b"\xff\x07" + data[middle + 2 :])
     with pytest.raises(InputError, match=r"image .*a\.jpg is damaged"):
         read_image(tmp_path / "a.jpg")
+
+
+@pytest.mark.parametrize("compression", ["LZW", "ADOBE_DEFLATE", "PACKBITS"])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_a_tiff_with_a_hole_is_damaged(tmp_path, compression, dtype, capfd):
+    picture = cv2.GaussianBlur(RNG.integers(0, 255, (240, 320, 3), dtype=np.uint8), (0, 0), 2).astype(dtype)
+    kind = [cv2.IMWRITE_TIFF_COMPRESSION, getattr(cv2, f"IMWRITE_TIFF_COMPRESSION_{compression}")]
+    data = cv2.imencode(".tif", picture, kind)[1].tobytes()
+    path = tmp_path / "a.tif"
+    path.write_bytes(data)
+    np.testing.assert_array_equal(read_image(path), eight_bits(picture))
+    path.write_bytes(with_hole(data, 0.1))
+    with pytest.raises(InputError, match=r"image .*a\.tif .*damaged"):
+        read_image(path)
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("quality", [20, 80, 100, 101])  # the last is without loss
+def test_a_webp_with_a_hole_is_damaged_and_one_of_one_colour_is_whole(tmp_path, quality):
+    picture = cv2.GaussianBlur(RNG.integers(0, 255, (480, 640, 3), dtype=np.uint8), (0, 0), 1)
+    path = tmp_path / "a.webp"
+    data = cv2.imencode(".webp", picture, [cv2.IMWRITE_WEBP_QUALITY, quality])[1].tobytes()
+    path.write_bytes(data)
+    assert read_image(path).shape == picture.shape
+    path.write_bytes(with_hole(data, 0.25))
+    with pytest.raises(InputError, match=r"image .*a\.webp is damaged"):
+        read_image(path)
+    whole = [image(value, 2048, 1536) for value in (0, 128, 255)]
+    half = np.vstack([picture, np.zeros_like(picture)])
+    clear = np.dstack([half, np.zeros(half.shape[:2], np.uint8)])  # with zeros of another kind
+    for shown in (*whole, half, clear):
+        path.write_bytes(cv2.imencode(".webp", shown, [cv2.IMWRITE_WEBP_QUALITY, quality])[1].tobytes())
+        assert read_image(path).shape == (*shown.shape[:2], 3)
 
 
 def test_a_png_with_a_hole_is_damaged(tmp_path, capfd):
