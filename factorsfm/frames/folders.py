@@ -18,6 +18,11 @@ from factorsfm.support.errors import InputError
 from factorsfm.support.json_text import is_text
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}) | PLATE_SUFFIXES
+# Of phones, cameras and film tools; FFmpeg would take the tiles of the first ones for videos.
+UNREAD_SUFFIXES = frozenset(
+    {".heic", ".heif", ".avif", ".jxl", ".jp2", ".gif", ".tga", ".psd", ".hdr", ".cin", ".ppm", ".pgm"}
+    | {".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}
+)
 _COLOR = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
 _TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _TIFF_DAMAGE = re.compile("TIFF_Error (ZIPDecode|PackBitsDecode|Using code not yet|.*(Not enough data|Corrupted))")
@@ -26,6 +31,12 @@ _TIFF_DAMAGE = re.compile("TIFF_Error (ZIPDecode|PackBitsDecode|Using code not y
 def list_images(folder: Path) -> list[Path]:
     """Images of a folder in natural order (img2 before img10); an empty list if there are none."""
     return list_files(folder, IMAGE_SUFFIXES)
+
+
+def unread_images(folder: Path) -> list[str]:
+    """Names of the images of a folder in formats that are not read, without those that are beside as another file."""
+    read = {path.stem for path in list_images(folder)}
+    return [path.name for path in list_files(folder, UNREAD_SUFFIXES) if path.stem not in read]
 
 
 def list_files(folder: Path, suffixes: Collection[str]) -> list[Path]:

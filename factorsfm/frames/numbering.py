@@ -8,12 +8,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from factorsfm.frames.folders import IMAGE_SUFFIXES, list_images
+from factorsfm.frames.folders import IMAGE_SUFFIXES, list_images, unread_images
 from factorsfm.frames.name_times import times_in
 from factorsfm.frames.sequences import is_negative, mixture, sequence_numbers
 from factorsfm.support.errors import InputError
+from factorsfm.support.first_few import first_few
 
 _NAMED_GAPS = 5
+_NAMED = 2  # files in a message
 _NESTED = ("*", "*/*", "*/*/*")  # how deep images are looked for that a folder itself does not hold
 
 
@@ -31,10 +33,7 @@ def numbered_images(folder: Path) -> list[FrameFile]:
     Raises:
         InputError: the folder holds no images, several sequences, other files beside a long one, or negative numbers.
     """
-    paths = list_images(folder)
-    if not paths:
-        suffixes = ", ".join(sorted(suffix[1:] for suffix in IMAGE_SUFFIXES))
-        raise InputError(f"folder {folder} holds no images ({suffixes}){_where_images_are(folder)}")
+    paths = images_of(folder)
     names = [path.name for path in paths]
     refuse_mixture(folder, names)
     if (times := times_in(names)) is not None:
@@ -42,6 +41,21 @@ def numbered_images(folder: Path) -> list[FrameFile]:
         return [FrameFile(k, path, time) for k, (time, path) in enumerate(timed)]
     numbers = sequence_numbers(names) or range(len(paths))
     return [FrameFile(number, path) for number, path in zip(numbers, paths, strict=True)]
+
+
+def images_of(folder: Path) -> list[Path]:
+    """As `list_images`.
+
+    Raises:
+        InputError: there are none.
+    """
+    paths = list_images(folder)
+    if not paths:
+        suffixes = ", ".join(sorted(suffix[1:] for suffix in IMAGE_SUFFIXES))
+        unread = unread_images(folder)
+        hint = f"; {first_few(unread, _NAMED)}: convert them" if unread else _where_images_are(folder)
+        raise InputError(f"folder {folder} holds no images ({suffixes}){hint}")
+    return paths
 
 
 def _where_images_are(folder: Path) -> str:

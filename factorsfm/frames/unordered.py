@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from factorsfm.frames.fields import Fields
 from factorsfm.frames.folders import list_images, read_image, stated_pixel_aspect
 from factorsfm.frames.frame import Frame, bgr_image
-from factorsfm.frames.numbering import FrameFile, chosen, numbered_images, refuse_negative
+from factorsfm.frames.numbering import FrameFile, chosen, images_of, numbered_images, refuse_negative
 from factorsfm.frames.ranges import checked_range
 from factorsfm.frames.reading import read_frames
 from factorsfm.frames.sequences import is_ordered, mixture, split_sequences
@@ -73,7 +73,7 @@ def read_images(
         if numbered:
             images = chosen(numbered_images(folder), checked_range(frames or slice(None)))
         else:
-            images = [FrameFile(*image) for image in enumerate(list_images(folder))][frames or slice(None)]
+            images = [FrameFile(*image) for image in enumerate(images_of(folder))][frames or slice(None)]
         for index, path, time in images:
             try:
                 aspect = stated_pixel_aspect(path) if numbered else 1.0  # photographs have square pixels

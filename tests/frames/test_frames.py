@@ -13,12 +13,13 @@ import pytest
 from factorsfm.batch.plan import find_videos
 from factorsfm.frames import container
 from factorsfm.frames import video as video_files
-from factorsfm.frames.folders import read_image
+from factorsfm.frames.folders import read_image, unread_images
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.ranges import parse_range
 from factorsfm.frames.reading import read_frames
 from factorsfm.frames.silence import quiet_opencv
 from factorsfm.frames.tone import eight_bits
+from factorsfm.frames.unordered import read_images
 from factorsfm.support.errors import InputError
 
 RNG = np.random.default_rng(0)
@@ -291,6 +292,30 @@ def test_a_video_that_was_cut_off_says_so(tmp_path, caplog):
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     assert 1 < (read := len(list(read_frames(path)))) < 12
     assert f"shot.avi: only {read} of the 20 frames" in caplog.text
+
+
+def test_images_in_formats_that_are_not_read_are_named(tmp_path):
+    for number in range(3):
+        (tmp_path / f"IMG_{number:04d}.HEIC").write_bytes(b"\0\0\0\x18ftypheic")
+    hint = r"holds no images \(.*\); IMG_0000.HEIC, IMG_0001.HEIC, …: convert them$"
+    with pytest.raises(InputError, match=hint):
+        read_frames(tmp_path)
+    with pytest.raises(InputError, match=hint):
+        list(read_images(tmp_path))
+    with pytest.raises(InputError, match=r"IMG_0000\.HEIC is a single image"):
+        read_frames(tmp_path / "IMG_0000.HEIC")
+    cv2.imwrite(str(tmp_path / "IMG_0001.JPG"), image())  # as cameras write both
+    cv2.imwrite(str(tmp_path / "IMG_0003.JPG"), image())
+    assert unread_images(tmp_path) == ["IMG_0000.HEIC", "IMG_0002.HEIC"]
+
+
+@pytest.mark.parametrize("pattern", ["a.%04d.png", "a.####.png", "a.*.png", "a.100[1-9].png"])
+def test_a_pattern_of_names_is_refused_as_one(tmp_path, pattern):
+    cv2.imwrite(str(tmp_path / "a.1001.png"), image())
+    with pytest.raises(InputError, match=r"is a pattern of names in .*; a video file or a folder of images"):
+        read_frames(tmp_path / pattern)
+    with pytest.raises(InputError, match="does not exist"):
+        read_frames(tmp_path / "nowhere" / pattern)
 
 
 def test_single_image_file_is_refused_at_the_call(tmp_path):
