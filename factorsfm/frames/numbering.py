@@ -15,7 +15,7 @@ from factorsfm.support.errors import InputError
 from factorsfm.support.first_few import first_few
 
 _NAMED_GAPS = 5
-_NAMED = 2  # files in a message
+_NAMED = 3  # files or folders in a message
 _NESTED = ("*", "*/*", "*/*/*")  # how deep images are looked for that a folder itself does not hold
 
 
@@ -59,11 +59,11 @@ def images_of(folder: Path) -> list[Path]:
 
 
 def _where_images_are(folder: Path) -> str:
-    """The first folder inside that holds images, in words, as data sets and cameras nest theirs."""
+    """The folders inside that hold images, in words, as data sets and cameras nest theirs."""
     for pattern in _NESTED:
-        inside = (path for path in sorted(folder.glob(pattern)) if path.is_dir() and not path.name.startswith("."))
-        if found := next((path for path in inside if list_images(path)), None):
-            return f"; {found} holds some"
+        inside = [path for path in sorted(folder.glob(pattern)) if path.is_dir() and not path.name.startswith(".")]
+        if found := [path.relative_to(folder).as_posix() for path in inside if list_images(path)]:
+            return f"; folders inside do: {first_few(found, _NAMED)}"
     return ""
 
 

@@ -295,9 +295,9 @@ def test_a_video_that_was_cut_off_says_so(tmp_path, caplog):
 
 
 def test_images_in_formats_that_are_not_read_are_named(tmp_path):
-    for number in range(3):
+    for number in range(4):
         (tmp_path / f"IMG_{number:04d}.HEIC").write_bytes(b"\0\0\0\x18ftypheic")
-    hint = r"holds no images \(.*\); IMG_0000.HEIC, IMG_0001.HEIC, …: convert them$"
+    hint = r"holds no images \(.*\); IMG_0000.HEIC, IMG_0001.HEIC, IMG_0002.HEIC, …: convert them$"
     with pytest.raises(InputError, match=hint):
         read_frames(tmp_path)
     with pytest.raises(InputError, match=hint):

@@ -124,7 +124,7 @@ def test_images_in_folders_inside_are_named(tmp_path):
     write(tmp_path / "mav0" / "cam0" / "data" / "more", shot(0, 2), [1305031102.1, 1305031102.2])
     with pytest.raises(InputError, match=r"holds no images \(.*webp\)$"):
         list(read_frames(tmp_path))
-    with pytest.raises(InputError, match=r"; .*/mav0/cam0/data/more holds some$"):
+    with pytest.raises(InputError, match=r"\); folders inside do: cam0/data/more$"):
         list(read_frames(tmp_path / "mav0"))
 
 
