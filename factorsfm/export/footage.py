@@ -153,7 +153,10 @@ def image_sequence(folder: Path) -> Sequence:
             return Sequence(
                 folder.absolute(), parts[0].prefix, digits, parts[0].suffix, numbers[0], numbers[-1], missing
             )
-    raise InputError(f"the images in {folder} are not numbered alike, as film tools expect it of a sequence")
+    raise InputError(
+        f"the images in {folder} are not numbered alike, as film tools expect it of a sequence; the format undistorted "
+        "writes plates that are"
+    )
 
 
 def frames_of(shot: Shot, frames: Iterable[FrameResult]) -> Iterator[Frame]:
