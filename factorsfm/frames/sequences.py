@@ -83,6 +83,18 @@ def is_ordered(names: Sequence[str]) -> bool:
     return sequence_numbers(names) is not None or times_in(names) is not None
 
 
+def begin_with_numbers(names: Sequence[str]) -> bool:
+    """Whether names differ in several numbers alone, and the first of these is another one in each.
+
+    As in ``frame_0007_1305031102.175304.png``.
+    """
+    parts = [_DIGITS.split(name) for name in names]
+    if len({tuple(part[::2]) for part in parts}) != 1:
+        return False
+    columns = [{int(part) for part in column} for column in list(zip(*parts, strict=True))[1::2]]
+    return next((len(column) == len(names) for column in columns if len(column) > 1), False)
+
+
 def last_number(name: str) -> int | None:
     """The last number of a name that is no version, if it has another one; None for a name without numbers."""
     found = _around_numbers(name)

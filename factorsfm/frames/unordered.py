@@ -18,7 +18,7 @@ from factorsfm.frames.frame import Frame, bgr_image
 from factorsfm.frames.numbering import FrameFile, chosen, images_of, numbered_images, refuse_negative
 from factorsfm.frames.ranges import checked_range
 from factorsfm.frames.reading import read_frames
-from factorsfm.frames.sequences import is_ordered, mixture, split_sequences
+from factorsfm.frames.sequences import begin_with_numbers, is_ordered, mixture, split_sequences
 from factorsfm.frames.texture import BLANK_TEXTURE, image_texture
 from factorsfm.support.errors import InputError
 from factorsfm.support.json_text import as_text
@@ -148,7 +148,8 @@ def _refuse_mixture(folder: Path, names: list[str]) -> None:
 def _why_unordered(paths: list[Path]) -> str:
     patterns = {path.stem.rstrip("0123456789") for path in paths}
     alike = len(patterns) == 1 and all(path.stem[-1:].isdigit() for path in paths)
-    if not alike and not is_ordered([path.name for path in paths]):
+    names = [path.name for path in paths]
+    if not alike and not is_ordered(names) and not begin_with_numbers(names):
         return "the names are not numbered alike"
     return _too_little_is_shared(paths)
 

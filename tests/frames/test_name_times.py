@@ -31,7 +31,10 @@ SECONDS = [1305031102.97, 1305031103.003333, 1305031103.04, 1305031103.0700001]
         (["rgb-1305031102.175304.PNG", "rgb-1305031102.211214.png"], [1305031102.175304, 1305031102.211214]),
         (["1403636579763555584.png", "1403636579813555456.png"], [1403636579.763555584, 1403636579.813555456]),
         (["1403636579763.jpg"], [1403636579.763]),
+        (["1305031102-966667000.png", "1305031103-000000000.png"], [1305031102.966667, 1305031103.0]),
         (["0.000000.png", "0.033333.png", "0.066667.png"], [0.0, 0.033333, 0.066667]),
+        (["0.0.png", "0.04.png", "0.08.png", "0.12.png", "0.2.png"], [0.0, 0.04, 0.08, 0.12, 0.2]),
+        (["t0.967.png", "t1.000.png", "t1.033.png"], [0.967, 1.0, 1.033]),
     ],
 )
 def test_names_that_are_times(names, times):
@@ -45,7 +48,10 @@ def test_names_that_are_times(names, times):
         [f"plate.{number}.png" for number in range(1001, 1009)],
         [f"{number:010d}.png" for number in range(4)],
         [f"1.{number:06d}.png" for number in range(1, 5)],  # a scene and a frame
+        [f"{scene}.{number:03d}.png" for scene in (1, 2) for number in range(1, 9)],
+        [f"v1.{number}.png" for number in range(8, 12)],
         ["shot1.000001.png"],
+        ["1305031102_17.png", "1305031102_18.png"],
         ["20240131_120000.jpg", "20240131_120001.jpg"],
         ["IMG_1305031102175.jpg", "DSC_1305031102205.jpg"],
         ["1305031102.175304.png", "mask.png"],
@@ -82,6 +88,15 @@ def test_a_folder_of_them_is_a_shot_with_these_times(tmp_path, begin):
         live = list(open_source(tmp_path / "rgb", **options))
         assert [frame.index for frame in live] == list(range(10))
         np.testing.assert_allclose([frame.timestamp for frame in live], times, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["frame_{0:04d}_{1:.6f}.png", "f{0}-t{2}.png"])
+def test_frames_with_a_number_and_a_time_are_a_shot(tmp_path, name):
+    for k, image in enumerate(shot(0, 12)):
+        cv2.imwrite(str(tmp_path / name.format(k, 1305031102.8 + k / 30, 33 * k)), image)
+    assert not looks_unordered(tmp_path)
+    images = [frame.image for frame in read_frames(tmp_path)]
+    np.testing.assert_array_equal(images, shot(0, 12))
 
 
 def test_their_order_is_that_of_the_times(tmp_path):
