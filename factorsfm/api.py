@@ -16,6 +16,7 @@ from factorsfm.control.files import read_control
 from factorsfm.control.known import Control
 from factorsfm.frames.edits import AnotherView, LeftOut, left_out_of, read_edit, until_another_view
 from factorsfm.frames.fields import Fields
+from factorsfm.frames.folders import unread_images
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.numbering import first_number_of, missing_numbers, sequence_of
 from factorsfm.frames.ranges import checked_range
@@ -162,6 +163,8 @@ def _from_shot(given: Inputs, progress: Progress | None) -> Reconstruction:
         result.notes[:0] = [f"{part.said[0].upper()}{part.said[1:]}: left out." for part in edit.left_out]
     if sequence_of(given.source) and (gaps := missing_numbers([frame.index for frame in result.frames])):
         result.notes.append(f"The numbering of the frames has gaps: {gaps} are missing.")
+    if Path(given.source).is_dir() and (unread := unread_images(Path(given.source))):
+        result.notes.append(f"Images in formats that are not read, and left out: {first_few(unread, 5)}.")
     return result
 
 

@@ -85,7 +85,7 @@ class Inputs:
             names = [(index, path.name) for index, path in enumerate(list_images(folder))][self.frames or slice(None)]
         else:
             images = chosen(numbered_images(folder), self.frames or checked_range(slice(None)))
-            names = [(number, path.name) for number, path in images]
+            names = [(image.number, image.path.name) for image in images]
         find_frames(self.control, names)
 
     def footage(self) -> Iterator[Frame]:

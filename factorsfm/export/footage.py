@@ -11,7 +11,7 @@ import numpy as np
 
 from factorsfm.export.shot import Shot
 from factorsfm.frames.fields import Fields
-from factorsfm.frames.folders import list_images
+from factorsfm.frames.folders import list_images, read_image
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.numbering import missing_numbers
 from factorsfm.frames.photographs import in_format_of
@@ -59,7 +59,7 @@ def background(shot: Shot) -> Path | Sequence | None:
 
     Raises:
         InputError: the user gave a movie that cannot be decoded or whose fields were solved, or a folder whose images
-            are not a numbered sequence.
+            are not a numbered sequence, or photographs of several sizes.
     """
     path = shot.footage
     if path is None:
@@ -69,6 +69,8 @@ def background(shot: Shot) -> Path | Sequence | None:
         return None
     try:
         found, held = _movie(path, shot.fields) if path.is_file() else _numbered(path)
+        if isinstance(found, Sequence) and _are_photographs(shot):
+            _check_photographs(shot, found)
     except InputError as error:
         if shot.options.footage is not None:
             raise
@@ -92,6 +94,28 @@ def _numbered(folder: Path) -> tuple[Sequence, range]:
     """The images in a folder, and the numbers from the first to the last."""
     sequence = image_sequence(folder)
     return sequence, range(sequence.first, sequence.last + 1)
+
+
+def _are_photographs(shot: Shot) -> bool:
+    """Whether these are images in any order: counted from 0, turned and scaled to the format of their cameras."""
+    return bool(shot.reconstruction.options.get("unordered"))
+
+
+def _check_photographs(shot: Shot, sequence: Sequence) -> None:
+    """Refuse photographs that a film tool would show at other numbers, or in other sizes, than they were solved."""
+    for frame in shot.in_footage:
+        camera = shot.reconstruction.camera_of(frame)
+        if sequence.file(frame.index).name != frame.name:
+            raise InputError(
+                f"the photographs in {sequence.folder} are counted from 0, which is {shot.in_footage[0].name}; a plate "
+                "has the numbers of its files"
+            )
+        height, width = read_image(sequence.folder / frame.name).shape[:2]
+        if (width, height) != (camera.width, camera.height):
+            raise InputError(
+                f"{frame.name} has {width}x{height} pixels and was solved as one of {camera.width}x{camera.height}; a "
+                "plate has images of one size"
+            )
 
 
 def warn_of_missing(shot: Shot, held: Container[int]) -> None:
@@ -129,7 +153,10 @@ def image_sequence(folder: Path) -> Sequence:
             return Sequence(
                 folder.absolute(), parts[0].prefix, digits, parts[0].suffix, numbers[0], numbers[-1], missing
             )
-    raise InputError(f"the images in {folder} are not numbered alike, as film tools expect it of a sequence")
+    raise InputError(
+        f"the images in {folder} are not numbered alike, as film tools expect it of a sequence; the format undistorted "
+        "writes plates that are"
+    )
 
 
 def frames_of(shot: Shot, frames: Iterable[FrameResult]) -> Iterator[Frame]:
@@ -140,7 +167,7 @@ def frames_of(shot: Shot, frames: Iterable[FrameResult]) -> Iterator[Frame]:
     """
     assert shot.footage is not None
     wanted = [(frame, frame.index + shot.numbering.shift) for frame in frames]
-    are_photographs = bool(shot.reconstruction.options.get("unordered"))
+    are_photographs = _are_photographs(shot)
     images = _read(shot, slice(wanted[0][1], wanted[-1][1] + 1), photographs=are_photographs)
     for frame, index in wanted:
         found = next((image for image in images if image.index == index), None)

@@ -34,6 +34,7 @@ from factorsfm.result.image_sources import footage_of
 from factorsfm.result.reconstruction import Reconstruction
 from factorsfm.support.errors import InputError
 from factorsfm.support.file_names import check_name
+from factorsfm.support.first_few import first_few
 from factorsfm.support.up_axis import UpAxis
 
 _AS_RECONSTRUCTED = Defaults()
@@ -138,6 +139,8 @@ FORMATS = {
 
 _ANY_SIZES = ("colmap", "colmap-binary", "nerfstudio", "ply", "tum", "kitti")  # all other formats have one film back
 
+_NAMED = 4  # sizes in a message
+
 
 def export(
     reconstruction: Reconstruction, path: str | Path, *, format: str, options: ExportOptions | None = None
@@ -160,10 +163,11 @@ def export(
     for frame in reconstruction.frames:
         check_name(frame.name)
     chosen = FORMATS[format]
-    sizes = {(c.width, c.height) for c in map(reconstruction.camera_of, reconstruction.registered)}
+    sizes = sorted({(c.width, c.height) for c in map(reconstruction.camera_of, reconstruction.registered)})
     if len(sizes) > 1 and format not in _ANY_SIZES:
         raise InputError(
-            f"{format} is for images of one size, and these have {len(sizes)}; {', '.join(_ANY_SIZES)} take them"
+            f"{format} is for images of one size, and these have {first_few([f'{w}x{h}' for w, h in sizes], _NAMED)} "
+            f"pixels; {', '.join(_ANY_SIZES)} take them"
         )
     options = options or ExportOptions()
     _check_training(format, options)

@@ -21,6 +21,7 @@ from factorsfm.export.other_pixels import in_other_pixels
 from factorsfm.export.shot import Shot
 from factorsfm.frames.folders import read_image
 from factorsfm.frames.frame import Frame
+from factorsfm.frames.photographs import in_format_of
 from factorsfm.frames.plates import PLATE_SUFFIXES
 from factorsfm.frames.reading import read_frames
 from factorsfm.frames.writing import write_image
@@ -114,6 +115,7 @@ class _Writer:
     ) -> None:
         self._shot, self._folder, self._given, self._masks = shot, folder, given, masks
         self._new = {frame.index: (frame.name, new.camera_of(frame)) for frame in new.registered}
+        self._are_photographs = bool(shot.reconstruction.options.get("unordered"))
         self._lens: pycolmap.Camera | None = None  # that the straightening is for
         self._straightening: Straightening | None = None
 
@@ -130,8 +132,12 @@ class _Writer:
         bends = self._shot.options.undistorted and distorts(lens)
         target = self._folder / IMAGES / name
         copied = path is not None and not bends and path.suffix == target.suffix and not _is_turned(path)
-        if path is not None and (not copied or self._masks):
+        if path is not None and (not copied or self._masks or self._are_photographs):
             image = read_image(path)
+        stored = image
+        if image is not None and self._are_photographs:
+            image = in_format_of(lens, image)  # turned and scaled as it was solved
+            copied = copied and image is stored
         if image is not None and image.shape[:2] != (lens.height, lens.width):
             raise InputError(
                 f"the image {frame.name} of the footage has {image.shape[1]}x{image.shape[0]} pixels, the camera "
@@ -145,18 +151,22 @@ class _Writer:
         elif image is not None:
             options = _BEST_JPEG if target.suffix.lower() in (".jpg", ".jpeg") else ()
             write_image(target, image if straightening is None else straightening.image(image), options)
-        if self._masks and image is not None:
-            kept = ~self._ignored(frame, image)
+        if self._masks and image is not None and stored is not None:
+            kept = ~self._ignored(frame, image, stored)
             mask = self._folder / MASKS / self._masks[name]
             mask.parent.mkdir(parents=True, exist_ok=True)
             write_image(mask, 255 * (kept if straightening is None else straightening.mask(kept)).astype(np.uint8))
 
-    def _ignored(self, frame: FrameResult, image: NDArray[np.uint8]) -> NDArray[np.bool_]:
-        """(h, w) what of an image of the footage is to be ignored."""
-        seen = Frame(frame.index, image, frame.name)
-        given = self._given(seen) if self._given is not None else None
-        moving = moving_mask(self._shot.reconstruction, frame, seen)
-        return moving if given is None else moving | given
+    def _ignored(self, frame: FrameResult, image: NDArray[np.uint8], stored: NDArray[np.uint8]) -> NDArray[np.bool_]:
+        """(h, w) what of an image is to be ignored; `stored`: as it is in the footage, to which masks belong."""
+        given = self._given(Frame(frame.index, stored, frame.name)) if self._given is not None else None
+        moving = moving_mask(self._shot.reconstruction, frame, Frame(frame.index, image, frame.name))
+        if given is None:
+            return moving
+        if self._are_photographs:
+            lens = self._shot.reconstruction.camera_of(frame)
+            given = in_format_of(lens, 255 * given.astype(np.uint8)) > 127
+        return moving | given
 
 
 def _images_of(

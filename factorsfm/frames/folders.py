@@ -1,38 +1,42 @@
-"""Image files, and folders of them that are complete or still being filled."""
+"""Image files, and folders of them."""
 
 from __future__ import annotations
 
-import logging
 import re
-import threading
-import time
-from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+from collections.abc import Collection
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.frames.frame import Frame
 from factorsfm.frames.image_damage import damage_of, without_padding
 from factorsfm.frames.plates import PLATE_SUFFIXES, Pixels, plate_pixel_aspect, read_dpx, read_exr
-from factorsfm.frames.sequences import sequence_numbers
-from factorsfm.frames.silence import held_back, quiet_opencv
+from factorsfm.frames.silence import held_back, opencv_errors, quiet_opencv
 from factorsfm.frames.tone import eight_bits
 from factorsfm.support.errors import InputError
 from factorsfm.support.json_text import is_text
 
-logger = logging.getLogger(__name__)
-
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}) | PLATE_SUFFIXES
-_POLL_SECONDS = 0.1  # between two listings of a folder that is being filled
-_PATIENCE_SECONDS = 2.0  # a file that has not changed for so long and cannot be decoded is damaged
+# Of phones, cameras and film tools; FFmpeg would take the tiles of the first ones for videos.
+UNREAD_SUFFIXES = frozenset(
+    {".heic", ".heif", ".avif", ".jxl", ".jp2", ".gif", ".tga", ".psd", ".hdr", ".cin", ".ppm", ".pgm"}
+    | {".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}
+)
+_COLOR = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
+_TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_TIFF_DAMAGE = re.compile("TIFF_Error (ZIPDecode|PackBitsDecode|Using code not yet|.*(Not enough data|Corrupted))")
 
 
 def list_images(folder: Path) -> list[Path]:
     """Images of a folder in natural order (img2 before img10); an empty list if there are none."""
     return list_files(folder, IMAGE_SUFFIXES)
+
+
+def unread_images(folder: Path) -> list[str]:
+    """Names of the images of a folder in formats that are not read, without those that are beside as another file."""
+    read = {path.stem for path in list_images(folder)}
+    return [path.name for path in list_files(folder, UNREAD_SUFFIXES) if path.stem not in read]
 
 
 def list_files(folder: Path, suffixes: Collection[str]) -> list[Path]:
@@ -48,90 +52,13 @@ def list_files(folder: Path, suffixes: Collection[str]) -> list[Path]:
     for path in found:
         if not is_text(path.name):
             raise InputError(f"the file name {path.name!r} in {folder} is not UTF-8; rename the file")
-    return sorted(found, key=_natural_key)
+    return sorted(found, key=natural_key)
 
 
-def _natural_key(path: Path) -> tuple[list[str | int], str]:
+def natural_key(path: Path) -> tuple[list[str | int], str]:
+    """Sorts names as people do: img2 before img10."""
     parts = re.split(r"(\d+)", path.name)
     return [int(part) if i % 2 else part.lower() for i, part in enumerate(parts)], path.name
-
-
-def watch_folder(folder: Path, end_file: str | Path | None, closed: threading.Event) -> Iterator[Frame]:
-    """Images of a folder that is still being filled, in natural order, each once it is complete.
-
-    An image that cannot be decoded, or that appears after a later one was taken, is left out with a warning.
-
-    Args:
-        end_file: when this file exists (a name in the folder, or a path), the folder is complete.
-        closed: set by another thread when no further frames are wanted.
-    """
-    taken: set[str] = set()
-    last: Path | None = None
-    arrivals: dict[Path, _Arrival] = {}
-    index = -1
-    while not closed.is_set():
-        complete = end_file is not None and (folder / end_file).exists()  # tested before the folder is listed
-        waiting = [path for path in list_images(folder) if path.name not in taken]
-        arrivals = {path: _Arrival.seen(path, arrivals.get(path)) for path in waiting}
-        for path, arrival in arrivals.items():
-            late = last is not None and _natural_key(path) < _natural_key(last)
-            image = None if late else arrival.image(path)
-            if image is None and not late and not arrival.is_damaged():
-                break
-            taken.add(path.name)
-            if image is None:
-                cause = f"it appeared after {last.name}" if late and last is not None else "it is damaged"
-                logger.warning("image %s is left out: %s", path, cause)
-                continue
-            # Alone a name says its number; beside others a stray file might not go on with theirs.
-            numbers = sequence_numbers([path.name] if last is None else [last.name, path.name])
-            index = index + 1 if numbers is None or numbers[-1] <= index else numbers[-1]
-            last = path
-            yield Frame(index, image, path.name, path=path, pixel_aspect=stated_pixel_aspect(path))
-        else:
-            if complete:
-                return
-        closed.wait(_POLL_SECONDS)
-
-
-@dataclass(frozen=True, slots=True)
-class _Arrival:
-    """A file at one listing of the folder.
-
-    Attributes:
-        state: its size and time of change; None if it is gone.
-        since: monotonic time at which it was first seen in this state, seconds.
-        settled: whether it was in this state at the listing before.
-    """
-
-    state: tuple[int, int] | None
-    since: float
-    settled: bool
-
-    @staticmethod
-    def seen(path: Path, before: _Arrival | None) -> _Arrival:
-        try:
-            status = path.stat()
-        except OSError:  # renamed or removed after the listing
-            state = None
-        else:
-            state = (status.st_size, status.st_mtime_ns)
-        if before is None or before.state != state:
-            return _Arrival(state, time.monotonic(), False)
-        return _Arrival(state, before.since, True)
-
-    def image(self, path: Path) -> NDArray[np.uint8] | None:
-        """The image, None while the file is not complete."""
-        if not self.settled:
-            return None
-        try:
-            return read_image(path)
-        except InputError:
-            return None
-
-    def is_damaged(self) -> bool:
-        """Whether a file that cannot be decoded has not changed for so long that nothing more is to come."""
-        return time.monotonic() - self.since > _PATIENCE_SECONDS
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
@@ -165,7 +92,7 @@ def read_pixels(path: Path) -> Pixels:
     try:
         if damage == "doubtful" and all(map(_libjpeg_complains, (data, without_padding(data)))):
             raise InputError(f"image {path} is damaged")
-        image = _decoded(data)
+        image = _decoded_tiff(data, path) if data.startswith(_TIFF_STARTS) else _decoded(data)
     except cv2.error as error:
         raise InputError(f"image {path} cannot be decoded; it has too many pixels or is damaged") from error
     if image is None:
@@ -177,8 +104,16 @@ def read_pixels(path: Path) -> Pixels:
 
 def _decoded(data: bytes) -> NDArray[np.generic] | None:
     with quiet_opencv():
-        color = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
-        return cv2.imdecode(np.frombuffer(data, np.uint8), color) if data else None
+        return cv2.imdecode(np.frombuffer(data, np.uint8), _COLOR) if data else None
+
+
+def _decoded_tiff(data: bytes, path: Path) -> NDArray[np.generic] | None:
+    """OpenCV leaves parts black that cannot be decoded, and says so in its log alone."""
+    with opencv_errors() as said:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), _COLOR)
+    if _TIFF_DAMAGE.search(said.errors):
+        raise InputError(f"image {path} is damaged or truncated")
+    return image
 
 
 def _libjpeg_complains(data: bytes) -> bool:

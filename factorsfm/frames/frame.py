@@ -23,7 +23,8 @@ class Frame:
             ``plate.1043.exr``), else its position in the source, from 0; no range or step changes it.
         image: (h, w, 3) uint8, BGR.
         name: file name, perhaps with folders before it, or the zero-padded index for videos and iterables.
-        timestamp: seconds from the start of the video, None if unknown.
+        timestamp: seconds from the start of the video, or those in the file name (``1305031102.175304.png``); None if
+            unknown.
         dropped: number of frames of a live source that were dropped right before this one.
         path: the image file, whose EXIF data may hold the focal length; None if the frame is not from an image file.
         pixel_aspect: width of a shown pixel over its height, 1 for square ones.

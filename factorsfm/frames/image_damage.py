@@ -19,15 +19,19 @@ _HOLE = bytes(64)  # a block of a disk that was never written is far longer
 _PADDING = re.compile(rb"\x00*\xff[^\x00]", re.DOTALL)
 _ZEROS = re.compile(rb"\x00{8,}(\xff[^\x00])?", re.DOTALL)  # with the marker after them
 _END_OF_BLOCK = 0  # symbol of a Huffman table
+_RIFF, _WEBP, _LOSSY, _LOSSLESS = b"RIFF", b"WEBP", b"VP8 ", b"VP8L"
+_FLAT_PIXELS = 1024  # of a WebP of one colour, that are written as no more than a byte of zeros
 
 
 def damage_of(data: bytes) -> Damage:
-    """What is wrong with the bytes of a JPEG or PNG file; nothing is known of others.
+    """What is wrong with the bytes of a JPEG, PNG or WebP file; nothing is known of others.
 
     doubtful: a JPEG that is damaged if libjpeg complains of it, with and without the zeros that fill it up.
     """
     if data.startswith(_PNG_START):
         return _damage_of_png(data)
+    if data.startswith(_RIFF) and data[8:12] == _WEBP:
+        return _damage_of_webp(data)
     return _damage_of_jpeg(data) if data.startswith(_JPEG_START) else ""
 
 
@@ -51,6 +55,32 @@ def _damage_of_png(data: bytes) -> Damage:
             return ""
         position = end + 4
     return "damaged"
+
+
+def _damage_of_webp(data: bytes) -> Damage:
+    """The end is missing, or the image holds more zeros in a row than one of its size that shows a single colour."""
+    end = 8 + int.from_bytes(data[4:8], "little")
+    if end > len(data):
+        return "truncated"
+    position = 12
+    while position + 8 <= end:
+        kind, size = data[position : position + 4], int.from_bytes(data[position + 4 : position + 8], "little")
+        position += 8
+        if kind in (_LOSSY, _LOSSLESS):
+            width, height = _size_of_webp(kind, data[position : position + 10])
+            zeros = bytes(len(_HOLE) + width * height // _FLAT_PIXELS)
+            if data.find(zeros, position, position + size) >= 0:
+                return "damaged"
+        position += size + size % 2
+    return ""
+
+
+def _size_of_webp(kind: bytes, header: bytes) -> tuple[int, int]:
+    """Width and height: 14 bits each, after a tag and a mark, or after a byte and less one."""
+    if kind == _LOSSY:
+        return int.from_bytes(header[6:8], "little") % 2**14, int.from_bytes(header[8:10], "little") % 2**14
+    bits = int.from_bytes(header[1:5], "little")
+    return bits % 2**14 + 1, (bits >> 14) % 2**14 + 1
 
 
 def _damage_of_jpeg(data: bytes) -> Damage:

@@ -29,14 +29,16 @@ from factorsfm.frames.capture import (
     without_secrets,
 )
 from factorsfm.frames.fields import Fields
-from factorsfm.frames.folders import list_images, watch_folder
+from factorsfm.frames.folders import list_images, unread_images
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.ranges import checked_range
 from factorsfm.frames.raw import RawFormat, raw_frames
 from factorsfm.frames.reading import check_footage, read_frames, uniform, with_aspect
 from factorsfm.frames.unordered import Unusable, read_images
+from factorsfm.frames.watched_folder import watch_folder
 from factorsfm.support.context import Closing
 from factorsfm.support.errors import FactorsfmError, InputError
+from factorsfm.support.first_few import first_few
 
 logger = logging.getLogger(__name__)
 
@@ -66,7 +68,7 @@ def open_source(
         fields, pixel_aspect: of a video file, as in `read_frames`; the pixel aspect of other sources, too.
         raw: size and pixel format of raw frames.
         watch: whether to wait for further images in a folder. They are taken in natural order, each once it is
-            complete; one that appears after a later one was taken is left out.
+            complete; one that appears after a later one was taken, or belongs to another sequence, is left out.
         end_file: with `watch`, the folder is complete when this file exists (a name in the folder, or a path).
         drop: what happens when the consumer is too slow. True drops the frames that have waited longest, False makes
             the source wait, None drops for cameras and network streams only.
@@ -144,6 +146,8 @@ def _open_raw(source: BinaryIO | Literal["-"], raw: RawFormat | None, closed: th
 def _open_files(source: object, selection: slice, fields: Fields) -> _Opened:
     """A folder of images, a video file or an iterable of images."""
     if isinstance(source, str | Path) and Path(source).is_dir() and list_images(Path(source)):
+        if unread := unread_images(Path(source)):
+            logger.warning("images in formats that are not read are left out: %s", first_few(unread, 5))
         return _Opened(str(source), _readable(read_images(source, selection, numbered=True)), is_selected=True)
     name = str(source) if isinstance(source, str | Path) else "the sequence of images"
     files = cast("str | Path | Iterable[NDArray[np.uint8] | NDArray[np.uint16] | Frame]", source)

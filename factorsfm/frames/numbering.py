@@ -4,32 +4,78 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from factorsfm.frames.folders import IMAGE_SUFFIXES, list_images
+from factorsfm.frames.folders import IMAGE_SUFFIXES, list_images, unread_images
+from factorsfm.frames.name_times import times_in
 from factorsfm.frames.sequences import is_negative, mixture, sequence_numbers
 from factorsfm.support.errors import InputError
+from factorsfm.support.first_few import first_few
 
 _NAMED_GAPS = 5
+_NAMED = 3  # files or folders in a message
+_NESTED = ("*", "*/*", "*/*/*")  # how deep images are looked for that a folder itself does not hold
 
 
-def numbered_images(folder: Path) -> list[tuple[int, Path]]:
-    """The images of a shot with the numbers of its frames: those in the names of a sequence, else counted from 0.
+class FrameFile(NamedTuple):
+    """An image of a shot, the number of its frame, and its time where the names are times (seconds)."""
+
+    number: int
+    path: Path
+    time: float | None = None
+
+
+def numbered_images(folder: Path) -> list[FrameFile]:
+    """The images of a shot in order, with the numbers of its frames: those in the names of a sequence, else from 0.
 
     Raises:
         InputError: the folder holds no images, several sequences, other files beside a long one, or negative numbers.
     """
+    paths = images_of(folder)
+    names = [path.name for path in paths]
+    refuse_mixture(folder, names)
+    if (times := times_in(names)) is not None:
+        timed = sorted(zip(times, paths, strict=True))
+        return [FrameFile(k, path, time) for k, (time, path) in enumerate(timed)]
+    numbers = sequence_numbers(names) or range(len(paths))
+    return [FrameFile(number, path) for number, path in zip(numbers, paths, strict=True)]
+
+
+def images_of(folder: Path) -> list[Path]:
+    """As `list_images`.
+
+    Raises:
+        InputError: there are none.
+    """
     paths = list_images(folder)
     if not paths:
         suffixes = ", ".join(sorted(suffix[1:] for suffix in IMAGE_SUFFIXES))
-        raise InputError(f"folder {folder} holds no images ({suffixes})")
-    names = [path.name for path in paths]
+        unread = unread_images(folder)
+        hint = f"; {first_few(unread, _NAMED)}: convert them" if unread else _where_images_are(folder)
+        raise InputError(f"folder {folder} holds no images ({suffixes}){hint}")
+    return paths
+
+
+def _where_images_are(folder: Path) -> str:
+    """The folders inside that hold images, in words, as data sets and cameras nest theirs."""
+    for pattern in _NESTED:
+        inside = [path for path in sorted(folder.glob(pattern)) if path.is_dir() and not path.name.startswith(".")]
+        if found := [path.relative_to(folder).as_posix() for path in inside if list_images(path)]:
+            return f"; folders inside do: {first_few(found, _NAMED)}"
+    return ""
+
+
+def refuse_mixture(folder: Path, names: Sequence[str]) -> None:
+    """Refuse names of more than one sequence, of a long one and of others, or with negative numbers.
+
+    Raises:
+        InputError: they are.
+    """
     refuse_negative(folder, names)
-    numbers = sequence_numbers(names)
-    if numbers is None and (found := mixture(names)):
+    if sequence_numbers(names) is None and (found := mixture(names)):
         raise InputError(f"folder {folder} holds {found}; a folder with one of them is expected")
-    return list(zip(range(len(paths)) if numbers is None else numbers, paths, strict=True))
 
 
 def refuse_negative(folder: Path, names: Sequence[str]) -> None:
@@ -57,7 +103,7 @@ def first_number_of(source: object) -> int | None:
     return numbers[0] if numbers is not None else None
 
 
-def chosen(images: list[tuple[int, Path]], frames: slice) -> list[tuple[int, Path]]:
+def chosen(images: list[FrameFile], frames: slice) -> list[FrameFile]:
     """The images whose numbers are in a range; the steps begin at the first number that is there.
 
     Args:
@@ -66,15 +112,15 @@ def chosen(images: list[tuple[int, Path]], frames: slice) -> list[tuple[int, Pat
     Raises:
         InputError: there is none.
     """
-    first, last = images[0][0], images[-1][0]
+    first, last = images[0].number, images[-1].number
     start = max(frames.start, first)
     stop = last + 1 if frames.stop is None else frames.stop
-    found = [(number, path) for number, path in images if number in range(start, max(stop, start), frames.step)]
+    found = [image for image in images if image.number in range(start, max(stop, start), frames.step)]
     if not found:
         wanted = f"before number {stop}" if stop <= first else f"from number {frames.start} on"
         if first < stop <= last and first <= frames.start:
             wanted = f"with the numbers {frames.start} to {stop - 1}"
-        raise InputError(f"{images[0][1].parent} holds no frames {wanted}; its frames are {first} to {last}")
+        raise InputError(f"{images[0].path.parent} holds no frames {wanted}; its frames are {first} to {last}")
     return found
 
 

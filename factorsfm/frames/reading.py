@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -13,12 +14,14 @@ from numpy.typing import NDArray
 
 from factorsfm.frames.aspect import check_pixel_aspect
 from factorsfm.frames.fields import Fields
-from factorsfm.frames.folders import IMAGE_SUFFIXES, read_image, stated_pixel_aspect
+from factorsfm.frames.folders import IMAGE_SUFFIXES, UNREAD_SUFFIXES, read_image, stated_pixel_aspect
 from factorsfm.frames.frame import Frame, bgr_image
-from factorsfm.frames.numbering import chosen, numbered_images
+from factorsfm.frames.numbering import FrameFile, chosen, numbered_images
 from factorsfm.frames.ranges import checked_range
 from factorsfm.frames.video import decode, open_video
 from factorsfm.support.errors import InputError
+
+_PATTERN = re.compile(r"%0?\d*d|#|\*|\?|\[")  # of names, as other tools take it for the images of a folder
 
 
 def read_frames(
@@ -56,11 +59,13 @@ def read_frames(
         if path.is_dir():
             found = with_aspect(_folder_frames(chosen(numbered_images(path), selection)), pixel_aspect)
         elif path.is_file():
-            if path.suffix.lower() in IMAGE_SUFFIXES:
+            if path.suffix.lower() in IMAGE_SUFFIXES | (UNREAD_SUFFIXES - {".gif"}):
                 raise InputError(f"{path} is a single image; a video file or a folder of images is expected")
             found = with_aspect(decode(open_video(path), selection, fields), pixel_aspect)
         else:
             problem = "is neither a file nor a folder" if path.exists() else "does not exist"
+            if _PATTERN.search(path.name) and path.parent.is_dir():
+                problem = f"is a pattern of names in {path.parent}"
             raise InputError(f"{path} {problem}; a video file or a folder of images is expected")
         return uniform(found, str(path), selection.start)
     if isinstance(source, np.ndarray) and (source.ndim == 2 or (source.ndim == 3 and source.shape[-1] in (3, 4))):
@@ -130,6 +135,6 @@ def _array_frames(
             yield Frame(index, bgr_image(image, index), f"{index:06d}")
 
 
-def _folder_frames(images: list[tuple[int, Path]]) -> Iterator[Frame]:
-    for number, path in images:
-        yield Frame(number, read_image(path), path.name, path=path, pixel_aspect=stated_pixel_aspect(path))
+def _folder_frames(images: list[FrameFile]) -> Iterator[Frame]:
+    for number, path, time in images:
+        yield Frame(number, read_image(path), path.name, time, path=path, pixel_aspect=stated_pixel_aspect(path))

@@ -9,13 +9,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import PurePath
 
+from factorsfm.frames.name_times import times_in
+
 _DIGITS = re.compile(r"(\d+)")
 _VERSION = re.compile(r"(.*[^A-Za-z])?[vV]#{1,3}", re.DOTALL)  # plate_v## of plate_v02; v0001 is rather a frame
 _MINUS = re.compile(r"(.*[._])?-", re.DOTALL)  # before a negative number; the hyphen of shot-0001 joins two words
 # A number of frames: at 120 frames a second a day has 10 million of them. What is longer is a time or a serial number.
 _MOST_DIGITS = 8
 _GAPS = 4  # most numbers from the first to the last for each file of a sequence; those of times lie farther apart
-_LONG = 8  # files of a sequence beside which any other file is a stray one
+LONG = 8  # files of a sequence beside which any other file is a stray one
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,15 +65,34 @@ def numbered_names(names: Sequence[str]) -> list[NumberedName] | None:
 def sequence_numbers(names: Sequence[str]) -> list[int] | None:
     """The number in each name if they differ in nothing else, as ``plate.1001.exr``, ``plate.1002.exr``; else None.
 
+    Times are no numbers of frames.
+
     Args:
         names: in natural order.
     """
     found = numbered_names(names)
-    if found is None:
+    if found is None or times_in(names) is not None:
         return None
     numbers = [name.number for name in found]
     ascending = all(a < b for a, b in itertools.pairwise(numbers))
     return numbers if ascending and len(str(numbers[-1])) <= _MOST_DIGITS else None
+
+
+def is_ordered(names: Sequence[str]) -> bool:
+    """Whether the names say their order: by numbers or times, in which alone they differ."""
+    return sequence_numbers(names) is not None or times_in(names) is not None
+
+
+def begin_with_numbers(names: Sequence[str]) -> bool:
+    """Whether names differ in several numbers alone, and the first of these is another one in each.
+
+    As in ``frame_0007_1305031102.175304.png``.
+    """
+    parts = [_DIGITS.split(name) for name in names]
+    if len({tuple(part[::2]) for part in parts}) != 1:
+        return False
+    columns = [{int(part) for part in column} for column in list(zip(*parts, strict=True))[1::2]]
+    return next((len(column) == len(names) for column in columns if len(column) > 1), False)
 
 
 def last_number(name: str) -> int | None:
@@ -110,11 +131,13 @@ def split_sequences(names: Sequence[str]) -> tuple[list[list[NumberedName]], lis
 
 def mixture(names: Sequence[str]) -> str:
     """What makes the names of a folder more than one sequence, in words; empty where nothing does."""
+    if times_in(names) is not None:
+        return ""
     sequences, strays = split_sequences(names)
     if len(sequences) > 1:
         patterns = sorted(sequence[0].pattern for sequence in sequences)
         return f"{len(sequences)} sequences ({', '.join(patterns[:3])}{', ...' if len(patterns) > 3 else ''})"
-    if sequences and strays and len(sequences[0]) >= max(_LONG, len(strays)):
+    if sequences and strays and len(sequences[0]) >= max(LONG, len(strays)):
         more = f" and {len(strays) - 1} more files" if len(strays) > 1 else ""
         return f"{strays[0]}{more} beside the sequence {sequences[0][0].pattern}"
     return ""

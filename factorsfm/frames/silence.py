@@ -82,6 +82,18 @@ def held_back() -> Iterator[Said]:
 
 
 @contextmanager
+def opencv_errors() -> Iterator[Said]:
+    """Hold back the errors that OpenCV logs meanwhile, and whatever else is written; see `held_back`."""
+    with held_back() as said, _silence.lock:  # the level is that of all threads
+        level = cv2.utils.logging.getLogLevel()
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
+        try:
+            yield said
+        finally:
+            cv2.utils.logging.setLogLevel(level)
+
+
+@contextmanager
 def dropped_if_it_fails() -> Iterator[None]:
     """Drop what is written meanwhile if the block raises an exception, else pass it on; see `held_back`."""
     with held_back() as said:

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from factorsfm.frames.fields import Fields
 from factorsfm.frames.folders import list_images, read_image, stated_pixel_aspect
 from factorsfm.frames.frame import Frame, bgr_image
-from factorsfm.frames.numbering import chosen, numbered_images, refuse_negative
+from factorsfm.frames.numbering import FrameFile, chosen, images_of, numbered_images, refuse_negative
 from factorsfm.frames.ranges import checked_range
 from factorsfm.frames.reading import read_frames
-from factorsfm.frames.sequences import mixture, sequence_numbers, split_sequences
+from factorsfm.frames.sequences import begin_with_numbers, is_ordered, mixture, split_sequences
 from factorsfm.frames.texture import BLANK_TEXTURE, image_texture
 from factorsfm.support.errors import InputError
 from factorsfm.support.json_text import as_text
@@ -73,11 +73,11 @@ def read_images(
         if numbered:
             images = chosen(numbered_images(folder), checked_range(frames or slice(None)))
         else:
-            images = list(enumerate(list_images(folder)))[frames or slice(None)]
-        for index, path in images:
+            images = [FrameFile(*image) for image in enumerate(images_of(folder))][frames or slice(None)]
+        for index, path, time in images:
             try:
                 aspect = stated_pixel_aspect(path) if numbered else 1.0  # photographs have square pixels
-                yield Frame(index, read_image(path), path.name, path=path, pixel_aspect=aspect)
+                yield Frame(index, read_image(path), path.name, time, path=path, pixel_aspect=aspect)
             except InputError as error:
                 yield Unusable(index, path.name, str(error).replace(f"image {path}", "it"))
         return
@@ -115,8 +115,8 @@ def looks_unordered(source: Path, frames: slice | None = None) -> bool:
     images = list_images(source)
     names = [path.name for path in images]
     refuse_negative(source, names)
-    if sequence_numbers(names) is not None:
-        images = [path for _, path in chosen(numbered_images(source), checked_range(frames or slice(None)))]
+    if is_ordered(names):
+        images = [image.path for image in chosen(numbered_images(source), checked_range(frames or slice(None)))]
     else:
         _refuse_mixture(source, names)
         images = images[frames or slice(None)]
@@ -148,7 +148,8 @@ def _refuse_mixture(folder: Path, names: list[str]) -> None:
 def _why_unordered(paths: list[Path]) -> str:
     patterns = {path.stem.rstrip("0123456789") for path in paths}
     alike = len(patterns) == 1 and all(path.stem[-1:].isdigit() for path in paths)
-    if not alike and sequence_numbers([path.name for path in paths]) is None:
+    names = [path.name for path in paths]
+    if not alike and not is_ordered(names) and not begin_with_numbers(names):
         return "the names are not numbered alike"
     return _too_little_is_shared(paths)
 

@@ -81,10 +81,16 @@ class Shutter:
         """(2,) share of the time between frames that the readout takes along columns and rows, one of them zero."""
         return np.asarray(self.lens.shape[READOUT])
 
-    def known_with(self, estimate: LensEstimate) -> Shutter:
-        """The same beside a lens that was estimated with it."""
+    @property
+    def is_too_long(self) -> bool:
+        """Whether the sensor would not be done before the next frame."""
+        return bool(np.abs(self.readout).max() - _CLEARLY * self.std > _LONGEST)
+
+    def known_with(self, estimate: LensEstimate) -> Shutter | None:
+        """The same beside a lens that was estimated with it, None where that makes it too long."""
         std = estimate.shape_std[READOUT][self.readout != 0.0]
-        return Shutter(estimate.lens, float(np.fmax(std, self.std)[0]))
+        shutter = Shutter(estimate.lens, float(np.fmax(std, self.std)[0]))
+        return None if shutter.is_too_long else shutter
 
 
 def with_sweep(
@@ -218,9 +224,8 @@ def _believed(solved: BundleAdjustment, guess: State) -> Shutter | None:
     readout = solved.state.lens[READOUT]
     deviation = float(np.nanmax(np.fmax(std, left_out)[-2:]))
     logger.info("readout %s within %.3f frames, %.0f squared deviations", readout, deviation, evidence)
-    if evidence < _LEAST_EVIDENCE or np.abs(readout).max() - _CLEARLY * deviation > _LONGEST:
-        return None
-    return Shutter(Lens(np.exp(guess.log_focal), np.r_[guess.lens[DISTORTION], readout]), deviation)
+    shutter = Shutter(Lens(np.exp(guess.log_focal), np.r_[guess.lens[DISTORTION], readout]), deviation)
+    return None if evidence < _LEAST_EVIDENCE or shutter.is_too_long else shutter
 
 
 def seen_at_once(state: State, observations: Observations, weight: Array, *, moves: bool) -> State:

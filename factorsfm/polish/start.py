@@ -166,13 +166,14 @@ def _solved_core(shot: Shot, frames: list[int], observations: Observations, trac
     if few.sweep is not None:
         motion = _motion(adjustment, found.rest, o)
         shutter = find_shutter(adjustment, motion, options)
+    at_once = adjustment
     if shutter is not None:
         adjustment = solution_from(replace(adjustment.state, lens=shutter.lens.shape), few, options.polish)
     if options.estimates_lens:
-        adjustment, lens, zoom = _estimate_lens(
-            adjustment, shot, frames, options, search, zoom_beside, moves=not found.turns
-        )  # fmt: skip
-        shutter = shutter and shutter.known_with(lens)
+        moves = not found.turns
+        adjustment, lens, zoom = _estimate_lens(adjustment, shot, frames, options, search, zoom_beside, moves=moves)
+        if shutter is not None and (shutter := shutter.known_with(lens)) is None:
+            adjustment, lens, zoom = _estimate_lens(at_once, shot, frames, options, search, zoom_beside, moves=moves)
     elif shot.in_time and is_doubtful(adjustment, options):
         zoom = zoom_beside(adjustment)
     if motion is None or lens is not None or shutter is not None:

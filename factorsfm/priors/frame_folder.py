@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from factorsfm.frames.folders import IMAGE_SUFFIXES
 from factorsfm.frames.frame import Frame
+from factorsfm.frames.name_times import times_in
 from factorsfm.frames.sequences import last_number
 from factorsfm.support.errors import InputError
 
@@ -21,7 +22,8 @@ class FrameFolder:
     """A folder whose files belong to frames; a frame may lack one.
 
     A file belongs to the frame whose name it bears ("a.npy" or "a.jpg.npy" for "a.jpg"), otherwise to the frame with
-    its number: the last number in the frame's name that is no version, or the frame's index if the name has none.
+    its number: the last number in the frame's name that is no version, or the frame's index if the name has none. Files
+    that are named by times belong to frames with times: to each the nearest, within half of their usual step.
 
     Args:
         path: the folder.
@@ -51,6 +53,8 @@ class FrameFolder:
         self.asked = self.matched = 0
         self._first = files[0]
         self._by_name = {file.stem: file for file in files}
+        times = times_in([image_stem(file.stem) for file in files])
+        self._by_time = sorted(zip(times, files, strict=True)) if times is not None else []
         by_number: dict[int, list[Path]] = {}
         for file in files:
             stem = image_stem(file.stem)
@@ -75,8 +79,17 @@ class FrameFolder:
         for name in (frame.name, stem):
             if name in self._by_name:
                 return self._by_name[name]
+        if self._by_time:
+            return None if frame.timestamp is None else self._nearest(frame.timestamp)
         number = last_number(stem)
         return self._by_number.get(frame.index if number is None else number)
+
+    def _nearest(self, seconds: float) -> Path | None:
+        """The file whose time is nearest, within half of the usual step."""
+        times = np.array([time for time, _ in self._by_time])
+        k = int(np.abs(times - seconds).argmin())
+        reach = float(np.median(np.diff(times))) / 2 if len(times) > 1 else 0.0
+        return self._by_time[k][1] if abs(times[k] - seconds) <= reach else None
 
 
 def image_stem(name: str) -> str:

@@ -32,12 +32,14 @@ def lost_frames(frames: Sequence[FrameResult], images: Sequence[MappedImage]) ->
 
 def with_large_steps(sentence: str, frames: Sequence[FrameResult], images: Sequence[MappedImage]) -> str:
     """The sentence, and after it that frames get lost because each shows something else, where that is so."""
+    lost = np.array([not frame.registered for frame in frames], bool)
+    for a, b in _stretches(lost):  # what is on both sides of an interruption is the same
+        if a > 0 and b < len(frames) and _share(images[a - 1], images[b]) >= _LARGE_STEP:
+            lost[a:b] = False
     shares = []
-    for pair, (before, after) in zip(itertools.pairwise(frames), itertools.pairwise(images), strict=True):
-        if all(frame.registered for frame in pair) or any(frame.status in _UNTRACKED for frame in pair):
-            continue
-        ids = before.tracks.ids
-        shares.append(float(np.isin(ids, after.tracks.ids).mean()) if len(ids) else 0.0)
+    for k, pair in enumerate(itertools.pairwise(frames)):
+        if lost[k : k + 2].any() and not any(frame.status in _UNTRACKED for frame in pair):
+            shares.append(_share(images[k], images[k + 1]))
     if not shares or (typical := float(np.median(shares))) >= _LARGE_STEP:
         return sentence
     return (
@@ -46,9 +48,20 @@ def with_large_steps(sentence: str, frames: Sequence[FrameResult], images: Seque
     )
 
 
-def _without_pose(frames: Sequence[FrameResult], lost: NDArray[np.bool_]) -> str:
+def _share(before: MappedImage, after: MappedImage) -> float:
+    """Of the tracks of an image, those that another one has, too."""
+    ids = before.tracks.ids
+    return float(np.isin(ids, after.tracks.ids).mean()) if len(ids) else 0.0
+
+
+def _stretches(lost: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """First and one after the last position of each stretch."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], lost, [False]]).astype(int)))
-    stretches = [(frames[a].index, frames[b - 1].index) for a, b in edges.reshape(-1, 2).tolist()]
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def _without_pose(frames: Sequence[FrameResult], lost: NDArray[np.bool_]) -> str:
+    stretches = [(frames[a].index, frames[b - 1].index) for a, b in _stretches(lost)]
     said = [str(first) if first == last else f"{first} to {last}" for first, last in stretches[:_MOST_NAMED]]
     more = len(stretches) - len(said)
     return (

@@ -109,7 +109,10 @@ class ImuSource:
             InputError: it has none, or one before that of the last frame.
         """
         if time is None or not math.isfinite(time):
-            raise InputError(f"frame {index} has no time; an IMU needs those of all frames, as a video file has them")
+            raise InputError(
+                f"frame {index} has no time; an IMU needs those of all frames, as video files have them, and images "
+                "named by times"
+            )
         if self._times and not time > self._times[-1]:
             raise InputError(f"frame {index} is at {time:g} s, after one at {self._times[-1]:g} s; times must ascend")
         return time

@@ -47,6 +47,7 @@ _SURPRISE_PX, _SURPRISE_RATIO = 0.5, 3.0  # largest distance from the prediction
 _OTHERWISE_PX, _OTHERWISE_RATIO = 2.0, 5.0  # least distance from the motion of the image, and the same over the median
 _MAJORITY = 0.5  # share of the tracks that are found; with fewer, the prediction is wrong
 _AWAY_SECONDS = 2.0  # after which a track that left the view may be revived: only a camera that returns sees it again
+_INTERRUPTION_SECONDS = 0.5  # for which a lost view is expected back: a flash, a foreign frame, damage, a hand
 _REVIVAL_REACH = 2.0  # times that of a re-alignment: the place of a revived track is less certain
 _REPLENISH_SECONDS = 0.125  # between two searches for corners ...
 _REPLENISH_SHARE = 0.7  # ... unless a smaller share of `max_tracks` is alive
@@ -71,6 +72,33 @@ class TrackedFrame:
     texture: float
 
 
+@dataclass(frozen=True, slots=True)
+class _LostView:
+    """A frame before most tracks were lost at once, and those n tracks: what follows may be a mere interruption.
+
+    Attributes:
+        frame, texture: what was seen. ids: (n,); xy: (n, 2) pixels there; velocity: (n, 2) pixels per frame.
+        lost_at: number of the frame in which they were lost.
+    """
+
+    frame: GreyFrame
+    texture: float
+    ids: NDArray[np.int64]
+    xy: Array
+    velocity: Array
+    lost_at: int
+
+    def state(self) -> dict[str, Any]:
+        """Everything that `restored` needs."""
+        plain = {name: getattr(self, name) for name in ("texture", "ids", "xy", "velocity", "lost_at")}
+        return {"frame": self.frame.reduced, **plain}
+
+    @staticmethod
+    def restored(state: Mapping[str, Any]) -> _LostView:
+        """That of which `state` was taken."""
+        return _LostView(**{**state, "frame": GreyFrame.of(state["frame"])})
+
+
 class FlowTracker(Closing):
     """Follows image points through a video, one frame at a time, in bounded memory.
 
@@ -87,6 +115,7 @@ class FlowTracker(Closing):
         self._next_id = 0
         self._tracks = LiveTracks(options.window_px)
         self._ended = EndedTracks(options.window_px)
+        self._lost_view: _LostView | None = None
         self._avoided = np.zeros((0, 2), np.float32)  # pixels where no track may start
         self._motion: LocalMotion | None = None  # from the previous frame to the present one
         self._pool = ThreadPoolExecutor(2)
@@ -108,12 +137,14 @@ class FlowTracker(Closing):
         grey = np.ascontiguousarray(image) if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         frame = GreyFrame.of(grey)
         texture = frame.texture
-        if texture < _BLANK_SHARE * self._texture:  # the tracks wait for the next frame that shows something
+        if self._is_blank(texture):  # the tracks wait for the next frame that shows something
             return TrackedFrame(np.zeros(0, np.int64), np.zeros((0, 2)), 0, 0, texture)
         before = len(self._tracks)
         if self._previous is not None and before:
             self._follow(self._previous, frame, mask)
         lost = before - len(self._tracks)
+        if self._lost_view is not None:
+            self._look_for(self._lost_view, frame)
         if expected is not None:
             self.revive(grey, *expected)
         born = self._replenish(frame, mask)
@@ -151,21 +182,9 @@ class FlowTracker(Closing):
         Returns:
             The ids of the tracks that are alive again, (m,), and their pixels, (m, 2).
         """
-        o = self.options
-        inside = np.isfinite(xy).all(axis=1) & _inside(np.nan_to_num(xy), image.shape, o.border_px)
-        if not inside.any():
-            return np.zeros(0, np.int64), np.zeros((0, 2))
-        rows = self._ended.rows(ids[inside])
-        reach_px = _REVIVAL_REACH * o.realign_reach_px
-        start = xy[inside].astype(np.float32)
-        found, good = self._ended.patches.align(image, rows, start, o.realign_check_px, reach_px, self._pool)
-        good &= _inside(found, image.shape, o.border_px)
-        rows, found = rows[good], found[good]
-        revived = self._ended.ids[rows]
-        self._tracks.append(revived, found, self._local_velocity(found), self._ended.patches.take(rows))
-        self._tracks.keep(np.argsort(self._tracks.ids))
-        self._ended.remove(rows)
-        return np.asarray(revived), found.astype(np.float64)
+        good, found = self._found_again(image, ids, xy.astype(np.float32))
+        self._take_up(ids[good], found[good], self._local_velocity(found[good]))
+        return np.asarray(ids[good]), found[good].astype(np.float64)
 
     def state(self) -> dict[str, Any]:
         """Everything that `restore` needs."""
@@ -178,6 +197,7 @@ class FlowTracker(Closing):
             "previous": self._previous.reduced if self._previous is not None else None,
             "tracks": self._tracks.state(),
             "ended": self._ended.state(),
+            "lost_view": self._lost_view.state() if self._lost_view is not None else None,
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
@@ -188,10 +208,11 @@ class FlowTracker(Closing):
         self._previous = GreyFrame.of(state["previous"]) if state["previous"] is not None else None
         self._tracks.restore(state["tracks"])
         self._ended.restore(state["ended"])
+        self._lost_view = _LostView.restored(state["lost_view"]) if state["lost_view"] is not None else None
 
     def _follow(self, previous: GreyFrame, frame: GreyFrame, mask: Flags | None) -> None:
         """Steps 1 to 4: predict, re-align, search, and update the maps of the patches; end what is not found."""
-        tracks, old = self._tracks, self._tracks.xy
+        tracks, old, shown = self._tracks, self._tracks.xy, previous
         previous = match_exposure(previous, frame)
         predicted = self._flow.predict(previous, frame, old, tracks.velocity)
         checked = (tracks.ids + self._frame) % _CHECK_INTERVAL == 0
@@ -206,6 +227,11 @@ class FlowTracker(Closing):
         searched = missing[found[missing]]
         if len(searched):
             new[searched], found[searched] = self._realign(frame, searched, new[searched])
+        if found.mean() <= _MAJORITY and self._lost_view is None:
+            gone = ~found
+            self._lost_view = _LostView(
+                shown, self._texture, tracks.ids[gone], old[gone], tracks.velocity[gone], self._frame
+            )
         tracks.xy, tracks.velocity = new, new - old
         self._end(found, np.where(found[:, None], new, predicted), frame.full.shape, mask)
 
@@ -240,6 +266,46 @@ class FlowTracker(Closing):
         if found.mean() <= _MAJORITY:
             self._put_aside(np.nonzero(~found & ~left)[0], self._frame)
         self._tracks.keep(np.nonzero(found & ~left)[0])
+
+    def _is_blank(self, texture: float) -> bool:
+        """Whether a frame is black or a flash beside what was seen before, and not only beside an interruption."""
+        view = self._lost_view
+        return texture < _BLANK_SHARE * (self._texture if view is None else min(self._texture, view.texture))
+
+    def _look_for(self, view: _LostView, frame: GreyFrame) -> None:
+        """Take up the tracks of a view that was gone for a moment, if the frame shows most of them again."""
+        since = self._frame - view.lost_at
+        if since > frames_in(_INTERRUPTION_SECONDS, self.frame_rate):
+            self._lost_view = None
+        known = self._ended.holds(view.ids)
+        if since == 0 or self._lost_view is None or not known.any():
+            return
+        ids, xy, velocity = view.ids[known], view.xy[known], view.velocity[known]
+        place = self._flow.predict(match_exposure(view.frame, frame), frame, xy, velocity)
+        good, found = self._found_again(frame.full, ids, place)
+        if good.sum() <= _MAJORITY * len(view.ids):
+            return
+        self._motion = None  # that from the interruption to this frame means nothing
+        self._take_up(ids[good], found[good], (found - xy)[good] / np.float32(since + 1))
+        self._lost_view = None
+
+    def _found_again(self, image: Image, ids: NDArray[np.int64], xy: Array) -> tuple[Flags, Array]:
+        """Which ended tracks (n,) are near their places (n, 2) in an image, by their patches, and where (n, 2)."""
+        o, found = self.options, xy.copy()
+        good = np.isfinite(xy).all(axis=1) & _inside(np.nan_to_num(xy), image.shape, o.border_px)
+        if good.any():
+            reach_px, rows = _REVIVAL_REACH * o.realign_reach_px, self._ended.rows(ids[good])
+            align = self._ended.patches.align
+            found[good], aligned = align(image, rows, xy[good], o.realign_check_px, reach_px, self._pool)
+            good[good] = aligned & _inside(found[good], image.shape, o.border_px)
+        return good, found
+
+    def _take_up(self, ids: NDArray[np.int64], xy: Array, velocity: Array) -> None:
+        """Go on with ended tracks (n,), which are at pixels (n, 2)."""
+        rows = self._ended.rows(ids)
+        self._tracks.append(ids, xy, velocity, self._ended.patches.take(rows))
+        self._tracks.keep(np.argsort(self._tracks.ids))
+        self._ended.remove(rows)
 
     def _put_aside(self, rows: NDArray[np.intp], ready_from: int) -> None:
         if len(rows):

@@ -83,6 +83,11 @@ class EndedTracks:
         self._gather()
         return self.ids[self._ready_from <= frame]
 
+    def holds(self, ids: Ids) -> NDArray[np.bool_]:
+        """(n,) which of some tracks are remembered."""
+        self._gather()
+        return np.isin(ids, self.ids)
+
     def rows(self, ids: Ids) -> Rows:
         """The rows of some of the tracks."""
         order = np.argsort(self.ids)

@@ -501,3 +501,11 @@ def test_frames_are_read_no_further_than_asked(cli: Cli) -> None:
     assert cli.run(images, "--frames", "0:5") == 0
     with pytest.raises(InputError, match=r"0005\.png"):
         list(read_frames(images))
+
+
+def test_images_that_are_not_read_beside_others_are_noted(tmp_path):
+    folder = write_images(tmp_path / "shot", rendered("dolly").images)
+    (folder / "0020.heic").write_bytes(b"not read")
+    (folder / "0001.dng").write_bytes(b"of the same picture")
+    result = reconstruct(folder)
+    assert "Images in formats that are not read, and left out: 0020.heic." in result.notes

@@ -197,6 +197,62 @@ def test_images_that_exif_data_turn_are_written_upright(tmp_path: Path) -> None:
     assert np.abs(stored.astype(float) - upright).mean() < 2
 
 
+def photographs(folder: Path) -> Reconstruction:
+    """Counted from 0; the second image is stored at half the size, and the third one was turned to the left."""
+    result = stained(folder, ".png")
+    frames = [replace(frame, index=k, name=f"{k}.png") for k, frame in enumerate(result.frames)]
+    for k, frame in enumerate(result.frames):
+        image = cv2.imread(str(folder / frame.name))
+        (folder / frame.name).unlink()
+        if k == 1:
+            image = cv2.resize(image, (320, 240), interpolation=cv2.INTER_AREA)
+        if k == 2:
+            image = cv2.rotate(image, cv2.ROTATE_90_CLOCKWISE)
+        cv2.imwrite(str(folder / f"{k}.png"), image)
+    straight = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=PARAMS[:4])
+    options = {"source": str(folder), "unordered": True, "first_number": 0}
+    return replace(result, frames=frames, camera=straight, moving=None, options=options)
+
+
+@pytest.mark.parametrize("format", ["nerfstudio", "colmap"])
+def test_photographs_of_several_sizes_are_written_as_they_were_solved(tmp_path: Path, format: str) -> None:
+    result = photographs(tmp_path / "set")
+    (tmp_path / "masks").mkdir()
+    for frame in result.frames:
+        mask = np.zeros(cv2.imread(str(tmp_path / "set" / frame.name)).shape[:2], np.uint8)
+        mask[: len(mask) // 4] = 255  # ignored: what is above in the file
+        cv2.imwrite(str(tmp_path / "masks" / frame.name), mask)
+    options = ExportOptions(undistorted=format == "colmap", masks=tmp_path / "masks")
+    export(result, tmp_path / "out", format=format, options=options)
+    for frame in result.registered:
+        image = cv2.imread(str(tmp_path / "out" / "images" / frame.name))
+        assert image.shape == (480, 640, 3)
+        seen = result.observation_xy[result.observation_frame == frame.index]
+        assert all(np.linalg.norm(middle(image, place) - place) < 0.3 for place in seen)
+        ignored = cv2.imread(str(tmp_path / "out" / "masks" / frame.name), NONE) == 0
+        assert ignored.mean() == pytest.approx(0.25, abs=0.1)
+        assert ignored[240, 5 if frame.index == 2 else 635] == (frame.index == 2)
+        assert ignored[5, 320] == (frame.index != 2)
+
+
+def test_photographs_of_several_sizes_or_numbers_of_their_own_are_no_plate(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    result = photographs(tmp_path / "set")
+    export(result, tmp_path / "a", format="nuke")
+    assert caplog.messages == [
+        "there is no plate: 1.png has 320x240 pixels and was solved as one of 640x480; a plate has images of one size"
+    ]
+    with pytest.raises(InputError, match="a plate has images of one size"):
+        export(result, tmp_path / "b", format="blender", options=ExportOptions(footage=tmp_path / "set"))
+    numbered = stained(tmp_path / "numbered")
+    frames = [replace(frame, index=k) for k, frame in enumerate(numbered.frames)]
+    caplog.clear()
+    numbered.options["unordered"] = True
+    export(replace(numbered, frames=frames, moving=None), tmp_path / "c", format="blender")
+    assert "are counted from 0, which is shot.0010.jpg; a plate has the numbers of its files" in caplog.text
+
+
 def test_every_lens_has_its_own_pinhole(shot: Reconstruction, tmp_path: Path) -> None:
     frames = [replace(f, camera=pycolmap.Camera(shot.camera.todict())) for f in shot.frames]
     for k, frame in enumerate(frames):

@@ -13,11 +13,13 @@ import pytest
 from factorsfm.batch.plan import find_videos
 from factorsfm.frames import container
 from factorsfm.frames import video as video_files
-from factorsfm.frames.folders import read_image
+from factorsfm.frames.folders import read_image, unread_images
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.ranges import parse_range
 from factorsfm.frames.reading import read_frames
 from factorsfm.frames.silence import quiet_opencv
+from factorsfm.frames.tone import eight_bits
+from factorsfm.frames.unordered import read_images
 from factorsfm.support.errors import InputError
 
 RNG = np.random.default_rng(0)
@@ -292,6 +294,30 @@ def test_a_video_that_was_cut_off_says_so(tmp_path, caplog):
     assert f"shot.avi: only {read} of the 20 frames" in caplog.text
 
 
+def test_images_in_formats_that_are_not_read_are_named(tmp_path):
+    for number in range(4):
+        (tmp_path / f"IMG_{number:04d}.HEIC").write_bytes(b"\0\0\0\x18ftypheic")
+    hint = r"holds no images \(.*\); IMG_0000.HEIC, IMG_0001.HEIC, IMG_0002.HEIC, …: convert them$"
+    with pytest.raises(InputError, match=hint):
+        read_frames(tmp_path)
+    with pytest.raises(InputError, match=hint):
+        list(read_images(tmp_path))
+    with pytest.raises(InputError, match=r"IMG_0000\.HEIC is a single image"):
+        read_frames(tmp_path / "IMG_0000.HEIC")
+    cv2.imwrite(str(tmp_path / "IMG_0001.JPG"), image())  # as cameras write both
+    cv2.imwrite(str(tmp_path / "IMG_0003.JPG"), image())
+    assert unread_images(tmp_path) == ["IMG_0000.HEIC", "IMG_0002.HEIC"]
+
+
+@pytest.mark.parametrize("pattern", ["a.%04d.png", "a.####.png", "a.*.png", "a.100[1-9].png"])
+def test_a_pattern_of_names_is_refused_as_one(tmp_path, pattern):
+    cv2.imwrite(str(tmp_path / "a.1001.png"), image())
+    with pytest.raises(InputError, match=r"is a pattern of names in .*; a video file or a folder of images"):
+        read_frames(tmp_path / pattern)
+    with pytest.raises(InputError, match="does not exist"):
+        read_frames(tmp_path / "nowhere" / pattern)
+
+
 def test_single_image_file_is_refused_at_the_call(tmp_path):
     cv2.imwrite(str(tmp_path / "one.png"), image())
     with pytest.raises(InputError, match=r"one\.png is a single image"):
@@ -387,6 +413,39 @@ def test_a_marker_that_no_scan_holds_is_damage(tmp_path):
     (tmp_path / "a.jpg").write_bytes(data[:middle] + b"\xff\x07" + data[middle + 2 :])
     with pytest.raises(InputError, match=r"image .*a\.jpg is damaged"):
         read_image(tmp_path / "a.jpg")
+
+
+@pytest.mark.parametrize("compression", ["LZW", "ADOBE_DEFLATE", "PACKBITS"])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_a_tiff_with_a_hole_is_damaged(tmp_path, compression, dtype, capfd):
+    picture = cv2.GaussianBlur(RNG.integers(0, 255, (240, 320, 3), dtype=np.uint8), (0, 0), 2).astype(dtype)
+    kind = [cv2.IMWRITE_TIFF_COMPRESSION, getattr(cv2, f"IMWRITE_TIFF_COMPRESSION_{compression}")]
+    data = cv2.imencode(".tif", picture, kind)[1].tobytes()
+    path = tmp_path / "a.tif"
+    path.write_bytes(data)
+    np.testing.assert_array_equal(read_image(path), eight_bits(picture))
+    path.write_bytes(with_hole(data, 0.1))
+    with pytest.raises(InputError, match=r"image .*a\.tif .*damaged"):
+        read_image(path)
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("quality", [20, 80, 100, 101])  # the last is without loss
+def test_a_webp_with_a_hole_is_damaged_and_one_of_one_colour_is_whole(tmp_path, quality):
+    picture = cv2.GaussianBlur(RNG.integers(0, 255, (480, 640, 3), dtype=np.uint8), (0, 0), 1)
+    path = tmp_path / "a.webp"
+    data = cv2.imencode(".webp", picture, [cv2.IMWRITE_WEBP_QUALITY, quality])[1].tobytes()
+    path.write_bytes(data)
+    assert read_image(path).shape == picture.shape
+    path.write_bytes(with_hole(data, 0.25))
+    with pytest.raises(InputError, match=r"image .*a\.webp is damaged"):
+        read_image(path)
+    whole = [image(value, 2048, 1536) for value in (0, 128, 255)]
+    half = np.vstack([picture, np.zeros_like(picture)])
+    clear = np.dstack([half, np.zeros(half.shape[:2], np.uint8)])  # with zeros of another kind
+    for shown in (*whole, half, clear):
+        path.write_bytes(cv2.imencode(".webp", shown, [cv2.IMWRITE_WEBP_QUALITY, quality])[1].tobytes())
+        assert read_image(path).shape == (*shown.shape[:2], 3)
 
 
 def test_a_png_with_a_hole_is_damaged(tmp_path, capfd):

@@ -449,7 +449,7 @@ def test_a_folder_that_is_filled_no_further_ends(tmp_path):
 
 
 def test_damaged_and_late_images_are_left_out(tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr("factorsfm.frames.folders._PATIENCE_SECONDS", 0.25)
+    monkeypatch.setattr("factorsfm.frames.watched_folder._PATIENCE_SECONDS", 0.25)
     for value in (2, 4, 5):
         (tmp_path / f"{value}.jpg").write_bytes(encoded(10 * value, ".jpg"))
     (tmp_path / "4.jpg").write_bytes(encoded(40, ".jpg")[:-200])

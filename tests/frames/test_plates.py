@@ -244,7 +244,7 @@ def test_range_beside_a_sequence_is_refused_with_its_numbers(sequence, text, wor
 
 
 def test_gaps_of_a_sequence_are_named(sequence):
-    assert missing_numbers([number for number, _ in numbered_images(sequence)]) == "1004 to 1005, 1009"
+    assert missing_numbers([image.number for image in numbered_images(sequence)]) == "1004 to 1005, 1009"
     assert sequence_of(sequence) == [1001, 1002, 1003, 1006, 1007, 1008, 1010, 1011, 1012]
     assert missing_numbers([1, 3, 5]) == missing_numbers([4]) == missing_numbers([]) == ""
     assert missing_numbers(range(0, 80, 10)) == ""

@@ -421,7 +421,7 @@ def test_images_of_two_cameras(tmp_path: Path) -> None:
     written = json.loads((tmp_path / "splats" / "transforms.json").read_text())
     assert "w" not in written
     assert [frame["w"] for frame in written["frames"]] == [400, 300] * 3
-    with pytest.raises(InputError, match="chan is for images of one size, and these have 2"):
+    with pytest.raises(InputError, match="chan is for images of one size, and these have 300x300, 400x300 pixels"):
         export(again, tmp_path / "out.chan", format="chan")
 
 

@@ -13,7 +13,7 @@ from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import ErrorModel
 from factorsfm.adjustment.state import LENS_SIZE, State
 from factorsfm.lens.lens import Lens, through
-from factorsfm.lens.rolling_shutter import Recording, seen_at_once, with_sweep
+from factorsfm.lens.rolling_shutter import Recording, Shutter, seen_at_once, with_sweep
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.polish.polish import polish
 from factorsfm.report.result_folder import write_folder
@@ -207,6 +207,20 @@ def test_motion_is_seen_in_the_images_before_and_after():
 def test_no_sensor_reads_longer_than_until_the_next_frame():
     assert polished(rolling_problem("handheld", 0.99)).shutter is not None
     assert polished(rolling_problem("handheld", 1.3)).shutter is None
+
+
+def test_a_readout_that_grows_too_long_beside_an_unknown_lens_is_none(monkeypatch):
+    """As if the first look had taken 1.3 for less; all is then as without a shutter."""
+    problem = rolling_problem("handheld", 1.3, parallax=0.2)
+    ignored = polished(problem, lens="focal", guess=1.2, shutter="global")
+    shape = np.zeros(LENS_SIZE)
+    shape[-1] = 0.9
+    guess = Shutter(Lens(np.array([1.2 * problem.focal]), shape), 0.02)
+    monkeypatch.setattr("factorsfm.polish.start.find_shutter", lambda *_: guess)
+    found = polished(problem, lens="focal", guess=1.2)
+    assert found.shutter is None
+    assert found.lens.lens.focal == pytest.approx(ignored.lens.lens.focal, rel=1e-6)
+    np.testing.assert_array_equal(found.state.lens, ignored.state.lens)
 
 
 def test_errors_of_the_tracks_are_no_readout():

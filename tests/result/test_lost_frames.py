@@ -11,7 +11,7 @@ from factorsfm.result.reconstruction import FrameResult
 from factorsfm.support.errors import ReconstructionError
 from factorsfm.support.status import FrameStatus
 from factorsfm.tracks.image_tracks import ImageTracks
-from tests.frames.test_cuts import shot
+from tests.frames.test_cuts import HEIGHT, WIDTH, shot
 
 LOST, BLANK, POSED = FrameStatus.LOST, FrameStatus.BLANK, FrameStatus.REGISTERED
 CAMERA = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 100.0, 200, 100)
@@ -45,3 +45,11 @@ def test_a_frame_a_second_ends_with_a_word_on_its_steps():
     pictures = shot(0, 1) + shot(1, 1) + shot(2, 1) + shot(3, 1)
     with pytest.raises(ReconstructionError, match=r"The steps between frames are too large: only [0-9] %"):
         factorsfm.reconstruct(pictures, depth=None, unordered=False)
+
+
+def test_a_flash_before_the_map_starts_loses_no_other_frame_and_says_nothing_of_steps():
+    pictures = [*shot(0, 8), *shot(1, 1), *shot(0)[8:]]
+    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 480.0, WIDTH, HEIGHT)
+    result = factorsfm.reconstruct(pictures, camera=camera, depth=None, unordered=False)
+    assert [k for k, frame in enumerate(result.frames) if not frame.registered] == [8]
+    assert [note for note in result.notes if "Without a pose" in note] == ["Without a pose: frame 8 (1 of 17)."]

@@ -219,6 +219,28 @@ def test_tracks_wait_through_a_black_stretch():
     np.testing.assert_array_equal(kept[-1].xy, without[-1].xy)
 
 
+@pytest.mark.parametrize("kind", ["another scene", "noise", "several"])
+def test_tracks_go_on_after_an_interruption(kind):
+    """Even noise, beside which what follows has hardly any texture."""
+    shot = rendered("truck")
+    noise = np.random.default_rng(0).integers(0, 255, shot.images[0].shape, np.uint8)
+    other = cv2.flip(rendered("static").images[0], -1)
+    between = {"another scene": [other], "noise": [noise], "several": [other, other, noise]}[kind]
+    tracked = track_all([*shot.images[:5], *between, *shot.images[5:]])
+    before, after = tracked[4], tracked[5 + len(between)]
+    assert np.isin(before.ids, after.ids).mean() > 0.75
+    straight = track_all(shot.images)[5]
+    kept = np.intersect1d(np.intersect1d(before.ids, after.ids), straight.ids)
+    there, expected = (frame.xy[np.searchsorted(frame.ids, kept)] for frame in (after, straight))
+    assert np.median(np.linalg.norm(there - expected, axis=1)) < 0.01
+
+
+def test_a_lost_view_is_no_longer_sought_after_a_while():
+    shot, other = rendered("dolly"), cv2.flip(rendered("static").images[0], -1)
+    tracked = track_all([shot.images[0], *[other] * 20, shot.images[1]])
+    assert np.isin(tracked[0].ids, tracked[-1].ids).mean() < 0.15
+
+
 def test_a_cut_ends_all_tracks():
     other = cv2.flip(rendered("static").images[0], -1)
     before, after = track_all([rendered("dolly").images[0], other])
