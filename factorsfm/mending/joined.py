@@ -69,9 +69,9 @@ def joined(measured: MeasuredShot, given: UserTracks, lenses: dict[int, pycolmap
     supervised = SupervisedTracks(
         np.r_[known.ids, ids],
         (*known.names, *_new_names([track.name for track in kept], known.names, first)),
-        np.r_[known.sigma, np.full(len(kept), given.sigma)],
+        np.r_[known.sigma, [given.sigma / track.weight for track in kept]],
     )
-    notes = measured.notes
+    notes = (*measured.notes, *given.notes)
     if away := len(given.tracks) - len(kept):
         notes = (*notes, f"Of {given.source}, {away} of {len(given.tracks)} have no frame of the shot.")
     return replace(measured, images=images, supervised=supervised, colors=colors, notes=notes)
