@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import re
-import shutil
-import subprocess
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path, PurePath
 from typing import Any
@@ -14,22 +10,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.support.blender import found_in_blender
 from factorsfm.support.errors import InputError
 from factorsfm.support.first_few import first_few
 
 Array = NDArray[np.float64]
 
-_SECONDS = 300  # that Blender may take to open a file
-
-# Runs in Blender. A solve of Blender takes a marker with the offset of its track, too. `frame_offset` says which frame
+# A solve of Blender takes a marker with the offset of its track, too. `frame_offset` says which frame
 # of the footage frame 1 of the clip is.
 _SCRIPT = """
-import json, sys, bpy
-
-output = sys.argv[-1]
-if not bpy.data.filepath:
-    sys.exit("Blender has opened no file")
-clips = []
+found = []
 for clip in bpy.data.movieclips:
     objects = []
     for object in clip.tracking.objects:
@@ -42,12 +32,10 @@ for clip in bpy.data.movieclips:
         if tracks:
             objects.append({"name": object.name, "camera": object.is_camera, "tracks": tracks})
     active = any(scene.active_clip == clip for scene in bpy.data.scenes)
-    clips.append({
+    found.append({
         "name": clip.name, "file": clip.filepath, "movie": clip.source == "MOVIE", "size": list(clip.size),
         "active": active, "objects": objects,
     })
-with open(output, "w", encoding="utf-8") as stream:
-    json.dump(clips, stream)
 """
 
 
@@ -89,20 +77,20 @@ def blender_tracks(path: Path) -> ClipTracks:
     Raises:
         InputError: Blender is not there or cannot read the file, or no clip or several ones have tracks.
     """
-    clips = [clip for clip in _clips(path) if clip["objects"]]
+    clips = [clip for clip in found_in_blender(path, _SCRIPT) if clip["objects"]]
     if len(clips) > 1:
         clips = [clip for clip in clips if clip["active"]] or clips
     if not clips:
-        raise InputError(f"tracks {path}: no movie clip has tracks; save the file in Blender after tracking")
+        raise InputError("no movie clip has tracks; save the file in Blender after tracking")
     if len(clips) > 1:
         names = first_few([clip["name"] for clip in clips], 5)
         raise InputError(
-            f"tracks {path}: {len(clips)} movie clips have tracks, {names}; one is expected, or one of them as the "
+            f"{len(clips)} movie clips have tracks, {names}; one is expected, or one of them as the "
             "active clip of the scene"
         )
     clip = clips[0]
     if min(clip["size"]) < 1:
-        raise InputError(f"tracks {path}: the size of the clip {clip['name']} is not known; its footage is expected")
+        raise InputError(f"the size of the clip {clip['name']} is not known; its footage is expected")
     return _tracks_of(clip, path)
 
 
@@ -122,27 +110,3 @@ def _tracks_of(clip: dict[str, Any], path: Path) -> ClipTracks:
     if of_camera and (count := sum(len(thing["tracks"]) for thing in clip["objects"] if not thing["camera"])):
         notes.append(f"Of tracks {path}, {count} of objects take no part; those of the camera do.")
     return ClipTracks(tracks, (int(size[0]), int(size[1])), notes)
-
-
-def _clips(path: Path) -> list[dict[str, Any]]:
-    """What the script says of the clips."""
-    if not path.is_file():
-        raise InputError(f"tracks {path} cannot be read: there is no such file")
-    blender = shutil.which("blender")
-    if blender is None:
-        raise InputError(f"tracks {path} are read by Blender; the program blender is expected in the PATH")
-    with tempfile.TemporaryDirectory() as folder:
-        script, found = Path(folder) / "script.py", Path(folder) / "clips.json"
-        script.write_text(_SCRIPT, encoding="utf-8")
-        command = [blender, "--background", "--factory-startup", "--disable-autoexec", "--python-exit-code", "1"]
-        command += [str(path.resolve()), "--python", str(script), "--", str(found)]
-        try:
-            subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, timeout=_SECONDS, check=True)
-            clips: list[dict[str, Any]] = json.loads(found.read_text(encoding="utf-8"))
-        except subprocess.TimeoutExpired:
-            raise InputError(f"tracks {path}: Blender has not opened the file in {_SECONDS} seconds") from None
-        except (OSError, ValueError, subprocess.CalledProcessError) as error:
-            raise InputError(
-                f"tracks {path}: Blender cannot open the file; one that it has saved is expected"
-            ) from error
-    return clips

@@ -170,9 +170,9 @@ def read_tracks(
 
 
 def _of_blender(path: Path, first_number: int | None, first_frame: int | None, sigma: float, on: Plate) -> UserTracks:
-    clip = blender_tracks(path)
     shift = first_frame_of(first_number, first_frame, FORMATS["tracks-blender"].defaults)
     try:
+        clip = blender_tracks(path)
         tracks = [
             UserTrack(track.name.strip(), track.frames - shift, track.xy - PIXEL_CENTER, track.weight)
             for track in clip.tracks
