@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from factorsfm.control.known import Control
+from factorsfm.lens.camera_model import distortion_of
+from factorsfm.lens.lens import Lens
 from factorsfm.mending.changes import Changes, MaskRegion
 from factorsfm.mending.joined import joined
 from factorsfm.mending.same_world import in_world_of
@@ -68,6 +73,7 @@ def solve_again(
         tracks = read_tracks(tracks, first_number=first_number)
     if tracks is not None:
         measured = joined(measured, tracks, {frame.index: known.camera_of(frame) for frame in known.frames})
+    measured = replace(measured, solved_lens=_solved_lens(known))
     with OneThreadEach():
         polished = _polished(measured, known, progress)
         solved = solved_shot(measured, polished, {"polish": time.perf_counter() - begin})
@@ -79,6 +85,13 @@ def solve_again(
     solved.options = {**known.options, "solved_again": [*known.options.get("solved_again", []), said]}
     solved.seconds["total"] = time.perf_counter() - begin
     return solved
+
+
+def _solved_lens(known: Reconstruction) -> Lens | None:
+    """The unknown lens that a result has found, None where it has found none, or one that zooms."""
+    if known.lens is None or known.lens.focal_std is None or known.has_own_lenses:
+        return None
+    return Lens(np.array([known.camera.mean_focal_length()]), np.r_[distortion_of(known.camera), np.zeros(2)])
 
 
 def _polished(measured: MeasuredShot, known: Reconstruction, progress: Progress | None) -> Polished:

@@ -23,11 +23,13 @@ from factorsfm import (
     solve_again,
 )
 from factorsfm.cli.main import main
+from factorsfm.polish import start
 from factorsfm.report.thumbnails import thumbnail
 from factorsfm.result.alignment import FREE_SCALE, Alignment
 from factorsfm.result.other_world import in_other_world
 from factorsfm.result.tracks_file import read_tracks, write_tracks
 from factorsfm.support.similarity import Similarity
+from factorsfm.synthetic import render_shot
 from tests.command_line import assert_error
 from tests.rendered import FRAMES, Maps, rendered, simulated_maps, with_fewer_tracks
 
@@ -100,6 +102,21 @@ def test_without_a_change_the_cameras_are_the_same(result: Reconstruction, folde
     assert again.notes == result.notes
     assert again.frames[1].covariance == pytest.approx(result.frames[1].covariance, rel=1e-3)
     assert (again.frames[0].prior is None) == (result.frames[0].prior is None)
+
+
+def test_an_unknown_lens_starts_where_it_was_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shot = render_shot("arc", 12, 320, 180, parallax=0.3)
+    images = [Frame(k, image, f"{k:06d}", k / 24) for k, image in enumerate(shot.images)]
+    factorsfm.reconstruct(images, depth=None).write(tmp_path / "unknown")
+    known = factorsfm.read_result(tmp_path / "unknown")
+    assert known.lens is not None
+    assert known.lens.focal_std is not None
+    monkeypatch.setattr(start, "_searched", lambda *arguments: pytest.fail("the lens was searched"))
+    solved = solve_again(known, mask_regions=["0,0,40,40"])
+    assert solved.lens is not None
+    off = np.log(solved.camera.mean_focal_length() / known.camera.mean_focal_length())
+    assert abs(off) < 0.5 * known.lens.focal_std
+    assert solved.lens.focal_std == pytest.approx(known.lens.focal_std, rel=0.3)
 
 
 def test_tracks_regions_and_frames_are_left_out(result: Reconstruction, folder: Path, tmp_path: Path) -> None:
