@@ -14,11 +14,11 @@ from typing import Any
 
 import cv2
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from factorsfm.control.known import STILL
 from factorsfm.support.blender import found_in_blender
+from factorsfm.support.colmap_model import open_colmap_model
 from factorsfm.support.errors import InputError
 from factorsfm.support.extras import require
 from factorsfm.support.json_reading import read_json, typed
@@ -148,12 +148,8 @@ def _is_model(folder: Path) -> bool:
 
 
 def _colmap(folder: Path) -> Poses:
-    try:
-        model = pycolmap.Reconstruction(folder)
-    except (ValueError, RuntimeError, IndexError) as error:
-        raise InputError(f"the COLMAP model in {folder} cannot be read") from error
     found: Poses = {}
-    for _, image in sorted(model.images.items()):
+    for _, image in sorted(open_colmap_model(folder).images.items()):
         if image.has_pose:
             _add(found, image.name, np.vstack([image.cam_from_world().inverse().matrix(), [0.0, 0.0, 0.0, 1.0]]))
     return found

@@ -377,6 +377,27 @@ def test_files_that_hold_no_camera_are_refused_in_one_sentence(
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("file", ["cameras", "images", "points3D", "rigs", "frames"])
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.6, 0.999])
+def test_a_binary_model_that_is_not_whole_is_refused(file: str, share: float, tmp_path: Path) -> None:
+    export(hard_reconstruction(), tmp_path / "model", format="colmap-binary")
+    path = tmp_path / "model" / f"{file}.bin"
+    data = path.read_bytes()
+    path.write_bytes(data[: int(share * len(data))])
+    with pytest.raises(InputError, match=rf"{file}.bin of the COLMAP model in .* is not whole"):
+        read_control(tmp_path / "model")
+
+
+@pytest.mark.parametrize("count", [2**40, 2**64 - 1])
+@pytest.mark.parametrize("file", ["cameras", "images", "points3D", "rigs", "frames"])
+def test_a_count_without_an_end_is_refused(count: int, file: str, tmp_path: Path) -> None:
+    export(hard_reconstruction(), tmp_path / "model", format="colmap-binary")
+    path = tmp_path / "model" / f"{file}.bin"
+    path.write_bytes(count.to_bytes(8, "little") + path.read_bytes()[8:])
+    with pytest.raises(InputError, match=rf"{file}.bin of the COLMAP model in .* is not whole"):
+        read_control(tmp_path / "model")
+
+
 def test_a_folder_without_a_model(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"neither images.bin nor images.txt nor transforms.json"):
         read_control(tmp_path)
