@@ -43,7 +43,8 @@ def joined(measured: MeasuredShot, given: UserTracks, lenses: dict[int, pycolmap
         frames = np.concatenate([track.frames for track in given.tracks])
         raise InputError(
             f"{given.source}: no track has two frames of the shot; its frames are {min(position)} to {max(position)}, "
-            f"those of the tracks {frames.min()} to {frames.max()}"
+            f"those of the tracks {frames.min()} to {frames.max()}; the number of the source's first frame in their "
+            "file is expected (--tracks-first-frame)"
         )
     first = 1 + max((int(image.tracks.ids[-1]) for image in measured.images if len(image.tracks.ids)), default=-1)
     ids = first + np.arange(len(kept))

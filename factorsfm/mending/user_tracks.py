@@ -35,6 +35,10 @@ _LARGEST = 1e6  # pixels and numbers of frames: beyond, a file holds something e
 _LONGEST_NAME = 100
 _LEAST_WEIGHT = 1e-3
 _COLUMNS = ("track", "frame", "x", "y")  # of a table
+_OTHER_FILE = (
+    "neither a table with track, frame, x and y, nor a script with Nuke's Tracker4, nor CameraTracker's or "
+    "3DEqualizer's text of 2-D tracks, nor After Effects' keyframes, nor a .blend file"
+)
 _MOST_SHOWN = 100  # characters of a line
 
 
@@ -148,7 +152,7 @@ def read_tracks(
     except OSError as error:
         raise InputError(f"tracks {path} cannot be read: {error.strerror or error}") from error
     except ValueError as error:
-        raise InputError(f"tracks {path} are no text") from error
+        raise InputError(f"tracks {path}: {_OTHER_FILE}") from error
     format, read = _format_of(text, path)
     from_top = format in ("tracks-csv", "tracks-after-effects")
     shift = first_frame_of(first_number, first_frame, FORMATS[format].defaults)
@@ -194,10 +198,7 @@ def _format_of(text: str, path: Path) -> tuple[str, Callable[[str], _Curves]]:
         return "tracks-camera-tracker", _of_camera_tracker
     if "," in start.partition("\n")[0]:
         return "tracks-csv", _of_table
-    raise InputError(
-        f"tracks {path}: neither a table with track, frame, x and y, nor a script with Nuke's Tracker4, nor "
-        "CameraTracker's or 3DEqualizer's text of 2-D tracks, nor After Effects' keyframes, nor a .blend file"
-    )
+    raise InputError(f"tracks {path}: {_OTHER_FILE}")
 
 
 def _of_table(text: str) -> _Curves:

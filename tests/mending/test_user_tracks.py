@@ -166,6 +166,12 @@ def test_files_that_cannot_be_read(text: str, words: str, tmp_path: Path) -> Non
         read_tracks(tmp_path / "tracks.txt")
 
 
+def test_a_file_that_is_no_text_is_told_what_is_read(tmp_path: Path) -> None:
+    (tmp_path / "shot.mp4").write_bytes(bytes(range(256)))
+    with pytest.raises(InputError, match=r"shot\.mp4: neither a table.* nor a \.blend file"):
+        read_tracks(tmp_path / "shot.mp4")
+
+
 @pytest.mark.parametrize(
     ("tracks", "words"),
     [
@@ -408,7 +414,9 @@ def test_a_track_that_cannot_be_placed_is_named(result: Reconstruction, tracks: 
         "Supervised tracks without a point, since the solved frames do not place it: window 9.",
         "Of the tracks, 1 of 4 have no frame of the shot.",
     ]
-    with pytest.raises(InputError, match="no track has two frames of the shot; its frames are 0 to 7"):
+    with pytest.raises(
+        InputError, match=r"no track has two frames of the shot; its frames are 0 to 7.*--tracks-first-frame"
+    ):
         solve_again(result, tracks=UserTracks([once, never]))
 
 
