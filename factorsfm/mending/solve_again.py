@@ -96,8 +96,16 @@ def _solved_lens(known: Reconstruction) -> Lens | None:
 
 def _polished(measured: MeasuredShot, known: Reconstruction, progress: Progress | None) -> Polished:
     """The final solve; an error knows what has become of the frames."""
-    try:
+
+    def solved(measured: MeasuredShot) -> Polished:
         return measured.solved(lambda stage: progress(stage, 0, None) if progress else None)
+
+    try:
+        polished = solved(measured)
+        lens = polished.lens
+        if measured.solved_lens is None or lens is None or lens.determined or lens.rough:
+            return polished
+        return solved(replace(measured, solved_lens=None))  # a search may find a lens where its earlier value does not
     except ReconstructionError as error:
         frames = add_results(mapped_results(measured.frames, measured.images), measured.footage)
         _take_over_pictures(frames, known)
