@@ -1,4 +1,4 @@
-"""The walk-through of docs/walkthrough.md, done as it is written, and its pictures.
+"""The walk-through of docs/walkthrough.md, done as it is written, its pictures, and that of the list of tracks.
 
     python -m benchmarks.walkthrough [--work FOLDER]
 
@@ -90,6 +90,12 @@ def pick_in_page(browser: Chromium, report: Path, walk: Walk) -> list[str]:
     return shlex.split(browser.run("byId('command').textContent"))[1:]
 
 
+def choose_tracks(browser: Chromium) -> None:
+    """Look at the track with the largest error in the open page, and choose it and the next one."""
+    browser.run("document.querySelector('#tracks_rows button').click()")
+    browser.run("[...document.querySelectorAll('#tracks_rows input')].slice(0, 2).forEach(box => box.click())")
+
+
 def run_blender(scene: Path, cube: str, folder: Path, rendered: Sequence[int] = ()) -> dict[int, NDArray[np.float64]]:
     """Add the cube to an exported scene in Blender.
 
@@ -139,6 +145,8 @@ def make_pictures(images: Path) -> None:
     browser = Chromium(Path("profile").absolute())
     words = pick_in_page(browser, Path("walk/view.html").absolute(), walk)
     (images / "walk-view.jpg").write_bytes(screenshot(browser, "#footage_section", "#align_section"))
+    choose_tracks(browser)
+    (images / "report-tracks.jpg").write_bytes(screenshot(browser, "#tracks_section", "#tracks_section"))
     browser.close()
     print("the page writes: factorsfm", shlex.join(words))
     run(walk.align)

@@ -168,7 +168,8 @@ def add_tracks(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="FILE",
         help="2-D tracks placed by hand or by another program, which take part with a weight of their own: a table "
-        "with track, frame, x and y, a Nuke script with Tracker4 nodes, or 3DEqualizer's text",
+        "with track, frame, x and y, a Nuke script with Tracker4 nodes, CameraTracker's or 3DEqualizer's text, After "
+        "Effects' keyframes, or a .blend file with a tracked movie clip",
     )
     parser.add_argument(
         "--tracks-sigma",

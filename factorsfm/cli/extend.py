@@ -9,6 +9,7 @@ from factorsfm.cli.command import Command, add_output, add_range, range_of, writ
 from factorsfm.cli.progress_line import ProgressLine
 from factorsfm.imagesets.add_images import add_images
 from factorsfm.report.result_folder import check_directory
+from factorsfm.support.errors import InputError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -29,6 +30,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace, progress: ProgressLine) -> str:
     """Write the result with the further images; see `Command.run`."""
     check_directory(arguments.output, arguments.images, arguments.source)
+    if arguments.output.resolve() == arguments.result.resolve() and (arguments.result / "tracks.npz").exists():
+        raise InputError(
+            "the output folder is that of the result, whose tracks the extended one does not keep; choose another one"
+        )
     reconstruction = add_images(
         arguments.result,
         arguments.images,

@@ -56,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="FILE",
         help="known poses, points, distances and heights (JSON), or the camera of another program (.chan, USD, "
-        "Alembic, transforms.json, COLMAP's folder): the result is in their world and unit",
+        "Alembic, .blend, transforms.json, COLMAP's folder): the result is in their world and unit",
     )
     add_align(parser)
     add_tracks(parser)

@@ -14,10 +14,11 @@ from typing import Any
 
 import cv2
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from factorsfm.control.known import STILL
+from factorsfm.support.blender import found_in_blender
+from factorsfm.support.colmap_model import open_colmap_model
 from factorsfm.support.errors import InputError
 from factorsfm.support.extras import require
 from factorsfm.support.json_reading import read_json, typed
@@ -27,6 +28,14 @@ Array = NDArray[np.float64]
 Poses = dict[str | int, Array]  # (4, 4) camera to world in OpenCV's axes, by name or number of the frame
 
 _COLMAP = ("images.bin", "images.txt")
+# The active camera of the scene, as its constraints and parents place it.
+_CAMERA_IN_BLENDER = """
+scene, found = bpy.context.scene, []
+for number in range(scene.frame_start, scene.frame_end + 1) if scene.camera else ():
+    scene.frame_set(number)
+    camera = scene.camera.evaluated_get(bpy.context.evaluated_depsgraph_get())
+    found.append((number, [list(row) for row in camera.matrix_world]))
+"""
 _LARGEST = 1e12  # of a number: its square stays finite
 
 
@@ -54,7 +63,7 @@ def is_camera_file(path: Path) -> bool:
 
 
 def read_tracked(path: Path, fps: float | None = None) -> TrackedCamera:
-    """The camera in a file: Nuke's .chan, USD, Alembic, nerfstudio's transforms.json, or a folder with COLMAP's model.
+    """The camera in a file of Nuke (.chan), USD, Alembic or Blender, nerfstudio's transforms.json, or COLMAP's model.
 
     Args:
         fps: of an Alembic archive, which has times instead of frames; None takes the rate that it states, as exports
@@ -139,12 +148,8 @@ def _is_model(folder: Path) -> bool:
 
 
 def _colmap(folder: Path) -> Poses:
-    try:
-        model = pycolmap.Reconstruction(folder)
-    except (ValueError, RuntimeError, IndexError) as error:
-        raise InputError(f"the COLMAP model in {folder} cannot be read") from error
     found: Poses = {}
-    for _, image in sorted(model.images.items()):
+    for _, image in sorted(open_colmap_model(folder).images.items()):
         if image.has_pose:
             _add(found, image.name, np.vstack([image.cam_from_world().inverse().matrix(), [0.0, 0.0, 0.0, 1.0]]))
     return found
@@ -235,6 +240,13 @@ def _collect(thing: Any, chain: list[Any], cameras: list[list[Any]], geom: Any) 
             _collect(thing.getChild(k), [*chain, (thing, header)], cameras, geom)
 
 
+def _blender(path: Path) -> Poses:
+    found = found_in_blender(path, _CAMERA_IN_BLENDER)
+    if not found:
+        raise InputError("its scene has no camera")
+    return {number: _opencv(_without_scale(np.array(matrix)), UpAxis.Z) for number, matrix in found}
+
+
 def _frame_rate(times: list[float]) -> float:
     """Frames a second: the samples next to each other are one frame apart."""
     steps = np.diff(times)
@@ -256,5 +268,5 @@ def _one(found: list[Any], names: list[str]) -> Any:
 
 
 _READERS: dict[str, Callable[[Path], Poses] | None] = {
-    ".chan": _chan, ".usd": _usd, ".usda": _usd, ".usdc": _usd, ".abc": None,
+    ".chan": _chan, ".usd": _usd, ".usda": _usd, ".usdc": _usd, ".abc": None, ".blend": _blender,
 }  # fmt: skip

@@ -20,6 +20,7 @@ from factorsfm.evaluation.truth import DepthLookup, DepthMaps, RawDepthMaps, Sho
 from factorsfm.frames.folders import list_files, list_images, read_image
 from factorsfm.frames.reading import read_frames
 from factorsfm.frames.video import VIDEO_SUFFIXES
+from factorsfm.support.colmap_model import open_colmap_model
 from factorsfm.support.errors import InputError
 from factorsfm.support.json_reading import read_json
 from factorsfm.support.rotations import nearest_rotation
@@ -208,10 +209,7 @@ def read_colmap(model: str | Path, images: str | Path, name: str | None = None) 
         InputError: the model cannot be read, or its images are missing or in several folders.
     """
     model, images = Path(model), Path(images)
-    try:
-        reconstruction = pycolmap.Reconstruction(model)
-    except (ValueError, RuntimeError) as error:
-        raise InputError(f"{model} is not a COLMAP model: {error}") from error
+    reconstruction = open_colmap_model(model)
     posed = [image for image in reconstruction.images.values() if image.has_pose]
     if not posed:
         raise InputError(f"the COLMAP model {model} has no registered image")

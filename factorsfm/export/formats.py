@@ -106,7 +106,12 @@ FORMATS = {
     ),
     "usd": Format("USD stage", write_usd, defaults=Defaults(UpAxis.Y, scale=100.0, first_frame=1001)),
     "alembic": Format("Alembic archive", write_alembic, defaults=Defaults(UpAxis.Y, first_frame=1001)),
-    "stmap": Format("maps that undistort and distort, 32-bit EXR", write_stmaps, is_folder=True),
+    "stmap": Format(
+        "maps that undistort and distort, 32-bit EXR",
+        write_stmaps,
+        is_folder=True,
+        defaults=Defaults(first_frame=1001),
+    ),
     "lens": Format(
         "the lens for Nuke, Blender and 3DEqualizer, with its deviation in each", write_lens, is_folder=True
     ),

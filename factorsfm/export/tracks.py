@@ -36,6 +36,7 @@ import bpy
 if DATA["footage"]:
     clip = bpy.data.movieclips.load(DATA["footage"])
     clip.frame_start = DATA["frame_start"]
+    bpy.context.scene.active_clip = clip  # a clip without a user is not saved
 else:
     clip = bpy.data.movieclips[0]  # the tracks are for the clip that is open
 for name, frames, places in DATA["tracks"]:

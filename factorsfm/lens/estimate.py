@@ -48,6 +48,7 @@ class _Solution:
         moves: whether the camera does.
         std, left_out: (g + 6,) of log focal lengths and shape, as in `lens_deviations`.
         known: whether the focal lengths count as determined.
+        believed: whether its distortion is.
     """
 
     adjustment: BundleAdjustment
@@ -55,6 +56,7 @@ class _Solution:
     std: Array
     left_out: Array
     known: bool
+    believed: bool
 
     @property
     def lens(self) -> Lens:
@@ -94,7 +96,7 @@ def estimate_lens(
     """
     guess, width = Lens.of(adjustment.state), observed_width(adjustment.state, adjustment.observations)
     if search is not None:
-        guess = replace(guess, focal=search.guess.focal)
+        guess = Lens(search.guess.focal, np.r_[search.guess.shape[DISTORTION], guess.shape[READOUT]])
     straight_sigmas, sigmas = _prior_sigmas(guess, options.lens, width)
     held = not options.refine_focal_length
     if held:
@@ -103,18 +105,24 @@ def estimate_lens(
     start, bent = adjustment.state, None
     if moves and not held:
         search = search or found_lens(adjustment, o, sigmas)
-        start, bent = through(start, search.straight.focal), search.bent
+        start, bent = _seen_through(start, Lens(search.straight.focal, guess.shape)), search.bent
     solver = LensSolver(adjustment.observations, o, focal_prior)
-    by_itself = start if moves else classify_motion(adjustment, options.polish).rotation_only
-    best = straight = _straight_solution(solver, by_itself, adjustment.sigma, straight_sigmas, moves=moves)
-    if sigmas[DISTORTION].any():
+    free: _Solution | None = None
+    if bent is not None and sigmas[DISTORTION].any():
         # Strong distortion moves the valley of the focal length: a start without any does not lead there.
-        bent = bent and Lens(bent.focal, np.r_[bent.shape[DISTORTION], guess.shape[READOUT]])
-        starts = [] if bent is None else [(_seen_through(adjustment.state, bent), adjustment.sigma, moves)]
-        starts.append((straight.adjustment.state, straight.adjustment.sigma, straight.moves))
-        free = _with_free_shape(solver, starts, sigmas)
-        if free is not None:
-            best = _judged_shape(straight, free, guess)
+        bent = Lens(bent.focal, np.r_[bent.shape[DISTORTION], guess.shape[READOUT]])
+        free = _free_solution(
+            solver, _seen_through(adjustment.state, bent), adjustment.sigma, sigmas, guess, moves=moves
+        )
+    if free is not None and free.believed:
+        best = free
+    else:
+        by_itself = start if moves else classify_motion(adjustment, options.polish).rotation_only
+        straight = _straight_solution(solver, by_itself, adjustment.sigma, straight_sigmas, moves=moves)
+        if free is None and sigmas[DISTORTION].any():
+            solved = straight.adjustment
+            free = _free_solution(solver, solved.state, solved.sigma, sigmas, guess, moves=straight.moves)
+        best = straight if free is None else free if free.believed else _with_doubt_of(straight, free)
     estimate = _concluded(best, guess, first_focal or (guess.focal, 0.0), options, held=held)
     return _settled(adjustment, best, estimate, start, options), estimate
 
@@ -138,49 +146,42 @@ def _straight_solution(solver: LensSolver, start: State, sigma: float, sigmas: A
     adjustment, moves = solver.solved_as_it_moves(start, sigma, sigmas, moves=moves)
     std, left_out, _ = lens_deviations(adjustment)
     known = _largest(std, left_out, len(start.log_focal)) < DETERMINED_FOCAL_STD
-    return _Solution(adjustment, moves, std, left_out, known)
+    return _Solution(adjustment, moves, std, left_out, known, believed=False)
 
 
-def _with_free_shape(
-    solver: LensSolver, starts: list[tuple[State, float, bool]], sigmas: Array
-) -> tuple[BundleAdjustment, bool] | None:
-    """Solved with free distortion, and whether the camera moves.
-
-    Args:
-        starts: with their noise and whether they move; the first one that leads to an invertible lens counts.
-    """
-    for state, sigma, moves in starts:
-        try:
-            return solver.solved_as_it_moves(state, sigma, sigmas, moves=moves)
-        except NotInvertibleError:
-            continue
-    return None
-
-
-def _judged_shape(straight: _Solution, free: tuple[BundleAdjustment, bool], guess: Lens) -> _Solution:
-    """The solution with a free shape where it is believed, else the one without, as uncertain as the other makes it.
-
-    Args:
-        free: with a free shape, and whether its camera moves.
-    """
-    groups = straight.groups
-    full, moves = free
+def _free_solution(
+    solver: LensSolver, start: State, sigma: float, sigmas: Array, guess: Lens, *, moves: bool
+) -> _Solution | None:
+    """The solution with free distortion, None where no invertible lens is found."""
+    try:
+        full, moves = solver.solved_as_it_moves(start, sigma, sigmas, moves=moves)
+    except NotInvertibleError:
+        return None
+    groups = len(full.state.log_focal)
     std, left_out, evidence = lens_deviations(full, guess.shape)
     displacement = _displacement(full, guess.shape)
+    largest = _largest(std, left_out, groups)
     logger.info(
         "distortion %s, %.0f squared deviations, displaces by %.1f pixels, noise %.2f; focal length within %.2f %%",
-        np.round(full.state.lens, 4), evidence, displacement, full.sigma, 100 * _largest(std, left_out, groups),
+        np.round(full.state.lens, 4), evidence, displacement, full.sigma, 100 * largest,
     )  # fmt: skip
     width = observed_width(full.state, full.observations) * float(np.median(full.state.focal))
     joint = np.hypot(_JOINT_DISPLACEMENT * width, _JOINT_NOISE * full.sigma)
     joint /= max(displacement, 1e-9)
     believed = evidence > _LEAST_EVIDENCE * (1.0 + evidence * joint**2)  # both variances add up
-    if believed and std[:groups].max() < DETERMINED_FOCAL_STD:
-        return _Solution(full, moves, std, left_out, _largest(std, left_out, groups) < DETERMINED_FOCAL_STD)
-    # A distortion that is not believed may be there all the same: second moment around what is kept.
-    moved = np.append(full.state.log_focal - straight.adjustment.state.log_focal, np.full(LENS_SIZE, np.nan))
+    believed &= std[:groups].max() < DETERMINED_FOCAL_STD
+    return _Solution(full, moves, std, left_out, largest < DETERMINED_FOCAL_STD, bool(believed))
+
+
+def _with_doubt_of(straight: _Solution, free: _Solution) -> _Solution:
+    """The solution without free distortion, as uncertain as one makes it that is not believed, but may be there all the
+    same: second moments around what is kept.
+    """
+    groups, state = straight.groups, free.adjustment.state
+    moved = np.append(state.log_focal - straight.adjustment.state.log_focal, np.full(LENS_SIZE, np.nan))
     std, left_out = (
-        np.fmax(kept, np.hypot(opened, moved)) for kept, opened in ((straight.std, std), (straight.left_out, left_out))
+        np.fmax(kept, np.hypot(opened, moved))
+        for kept, opened in ((straight.std, free.std), (straight.left_out, free.left_out))
     )
     known = straight.known and _largest(std, left_out, groups) < _OPEN_FOCAL_STD
     return replace(straight, std=std, left_out=left_out, known=known)

@@ -24,9 +24,9 @@ from factorsfm.support.options import PolishOptions
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-# Of the guess, at which the search starts: the focal length is free, and each start leads to the same minimum from a
+# Of a guess, at which the search starts: the focal length is free, and each start leads to the same minimum from a
 # factor of three away where the camera turns by a few degrees.
-_FACTORS = (0.6, 1.2, 2.4)
+FACTORS = (0.6, 1.2, 2.4)
 _ITERATIONS = 8
 _SIGMAS_PX = (4.0 * FIRST_SIGMA_PX, FIRST_SIGMA_PX)  # first wide: rotations from frame to frame have drifted
 _CELLS = (8, 5)  # across and down; what fills one counts once, however many tracks it has
@@ -34,14 +34,17 @@ _FEWEST = 6  # tracks that two frames have in common, from which a rotation is e
 _WIDTHS_PX = (8.0, 4.0, 2.0, 1.0, 1.0, 1.0)  # of the kernel of a frame's rotation, from wide to narrow
 
 
-def turning_camera(guess: State, observations: Observations, options: PolishOptions) -> State:
+def turning_camera(
+    guess: State, observations: Observations, options: PolishOptions, factors: tuple[float, ...] = FACTORS
+) -> State:
     """The camera that only turns before points at one distance, with the focal length that explains most.
 
     Args:
         guess: whose lens the search starts from, and whose world is kept; it has one focal length.
+        factors: of its focal length, at which the search starts.
     """
     fits = []
-    for factor in _FACTORS:
+    for factor in factors:
         _, part, few = some_frames(
             _chained(through(guess, factor * np.exp(guess.log_focal)), observations), observations
         )

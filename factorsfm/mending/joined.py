@@ -43,7 +43,8 @@ def joined(measured: MeasuredShot, given: UserTracks, lenses: dict[int, pycolmap
         frames = np.concatenate([track.frames for track in given.tracks])
         raise InputError(
             f"{given.source}: no track has two frames of the shot; its frames are {min(position)} to {max(position)}, "
-            f"those of the tracks {frames.min()} to {frames.max()}"
+            f"those of the tracks {frames.min()} to {frames.max()}; the number of the source's first frame in their "
+            "file is expected (--tracks-first-frame)"
         )
     first = 1 + max((int(image.tracks.ids[-1]) for image in measured.images if len(image.tracks.ids)), default=-1)
     ids = first + np.arange(len(kept))
@@ -69,9 +70,9 @@ def joined(measured: MeasuredShot, given: UserTracks, lenses: dict[int, pycolmap
     supervised = SupervisedTracks(
         np.r_[known.ids, ids],
         (*known.names, *_new_names([track.name for track in kept], known.names, first)),
-        np.r_[known.sigma, np.full(len(kept), given.sigma)],
+        np.r_[known.sigma, [given.sigma / track.weight for track in kept]],
     )
-    notes = measured.notes
+    notes = (*measured.notes, *given.notes)
     if away := len(given.tracks) - len(kept):
         notes = (*notes, f"Of {given.source}, {away} of {len(given.tracks)} have no frame of the shot.")
     return replace(measured, images=images, supervised=supervised, colors=colors, notes=notes)

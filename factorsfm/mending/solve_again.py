@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from factorsfm.control.known import Control
+from factorsfm.lens.camera_model import distortion_of
+from factorsfm.lens.lens import Lens
 from factorsfm.mending.changes import Changes, MaskRegion
 from factorsfm.mending.joined import joined
 from factorsfm.mending.same_world import in_world_of
@@ -68,6 +73,7 @@ def solve_again(
         tracks = read_tracks(tracks, first_number=first_number)
     if tracks is not None:
         measured = joined(measured, tracks, {frame.index: known.camera_of(frame) for frame in known.frames})
+    measured = replace(measured, solved_lens=_solved_lens(known))
     with OneThreadEach():
         polished = _polished(measured, known, progress)
         solved = solved_shot(measured, polished, {"polish": time.perf_counter() - begin})
@@ -81,10 +87,25 @@ def solve_again(
     return solved
 
 
+def _solved_lens(known: Reconstruction) -> Lens | None:
+    """The unknown lens that a result has found, None where it has found none, or one that zooms."""
+    if known.lens is None or known.lens.focal_std is None or known.has_own_lenses:
+        return None
+    return Lens(np.array([known.camera.mean_focal_length()]), np.r_[distortion_of(known.camera), np.zeros(2)])
+
+
 def _polished(measured: MeasuredShot, known: Reconstruction, progress: Progress | None) -> Polished:
     """The final solve; an error knows what has become of the frames."""
-    try:
+
+    def solved(measured: MeasuredShot) -> Polished:
         return measured.solved(lambda stage: progress(stage, 0, None) if progress else None)
+
+    try:
+        polished = solved(measured)
+        lens = polished.lens
+        if measured.solved_lens is None or lens is None or lens.determined or lens.rough:
+            return polished
+        return solved(replace(measured, solved_lens=None))  # a search may find a lens where its earlier value does not
     except ReconstructionError as error:
         frames = add_results(mapped_results(measured.frames, measured.images), measured.footage)
         _take_over_pictures(frames, known)

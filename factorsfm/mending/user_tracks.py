@@ -1,7 +1,7 @@
 """2-D tracks of the user: placed by hand, or made by another program, and read from its file.
 
 The files are those that `export` writes, the table (CSV), Nuke's Tracker, CameraTracker's and 3DEqualizer's text, and
-the keyframes that After Effects copies.
+the keyframes that After Effects copies; and files of Blender with a movie clip.
 """
 
 from __future__ import annotations
@@ -18,8 +18,10 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from factorsfm.camera.projection import PIXEL_CENTER
 from factorsfm.export.formats import FORMATS
 from factorsfm.export.shot import first_frame_of
+from factorsfm.mending.blender_file import blender_tracks
 from factorsfm.mending.nuke_tracker import nuke_tracks
 from factorsfm.support.errors import InputError
 
@@ -31,7 +33,12 @@ _Curves = dict[str, dict[int, tuple[float, float]]]  # by name and number of the
 DEFAULT_SIGMA_PX = 0.5  # of a place that a person has set with care; automatic trackers are better
 _LARGEST = 1e6  # pixels and numbers of frames: beyond, a file holds something else
 _LONGEST_NAME = 100
+_LEAST_WEIGHT = 1e-3
 _COLUMNS = ("track", "frame", "x", "y")  # of a table
+_OTHER_FILE = (
+    "neither a table with track, frame, x and y, nor a script with Nuke's Tracker4, nor CameraTracker's or "
+    "3DEqualizer's text of 2-D tracks, nor After Effects' keyframes, nor a .blend file"
+)
 _MOST_SHOWN = 100  # characters of a line
 
 
@@ -43,6 +50,7 @@ class UserTrack:
         name: as the user calls it.
         frames: (k,) numbers of the frames as in a result, ascending; a list does.
         xy: (k, 2) pixels with centres at integers; see `UserTracks`. A list does.
+        weight: what the standard deviation is divided by.
 
     Raises:
         InputError: there is no place, a frame is there twice, or a value is none.
@@ -51,6 +59,7 @@ class UserTrack:
     name: str
     frames: Index
     xy: Array
+    weight: float = 1.0
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not _is_name(self.name):
@@ -65,6 +74,8 @@ class UserTrack:
             raise InputError(f'the frames of track "{self.name}" do not ascend')
         if not (np.abs(xy) < _LARGEST).all() or not (np.abs(frames) <= _LARGEST).all() or (frames % 1.0).any():
             raise InputError(f'track "{self.name}" has a place or a frame that is none')
+        if not _LEAST_WEIGHT <= self.weight <= 1.0 / _LEAST_WEIGHT:
+            raise InputError(f'the weight of track "{self.name}" is {self.weight:g}; 0.001 to 1000 is expected')
         object.__setattr__(self, "frames", frames.astype(np.int64))
         object.__setattr__(self, "xy", xy)
 
@@ -84,6 +95,7 @@ class UserTracks:
         from_bottom: whether their y counts upwards, from the bottom edge of the image (not from a pixel's centre).
         source: where they come from, for people.
         size: width and height of the image that they were placed in, pixels, if that is known.
+        notes: what of their file takes no part, in sentences.
 
     Raises:
         InputError: there is no track, two have the same name, or the standard deviation is none.
@@ -95,6 +107,7 @@ class UserTracks:
     from_bottom: bool = False
     source: str = "the tracks"
     size: tuple[int, int] | None = None
+    notes: Sequence[str] = ()
 
     def __post_init__(self) -> None:
         if not self.tracks:
@@ -119,7 +132,8 @@ def read_tracks(
     sigma: float = DEFAULT_SIGMA_PX,
     on: Plate | None = None,
 ) -> UserTracks:
-    """Read tracks from a table, a Nuke script, the text of CameraTracker or 3DEqualizer, or After Effects' keyframes.
+    """Read tracks from a table, a Nuke script, the text of CameraTracker or 3DEqualizer, After Effects' keyframes, or a
+    file of Blender, which Blender reads.
 
     Args:
         first_number: with which the numbered sequence begins that is the source; None for all other sources.
@@ -131,12 +145,14 @@ def read_tracks(
         InputError: the file cannot be read, or is none of these.
     """
     path = Path(path)
+    if path.suffix.lower() == ".blend":
+        return _of_blender(path, first_number, first_frame, sigma, on or "footage")
     try:
         text = path.read_text(encoding="utf-8-sig")
     except OSError as error:
         raise InputError(f"tracks {path} cannot be read: {error.strerror or error}") from error
     except ValueError as error:
-        raise InputError(f"tracks {path} are no text") from error
+        raise InputError(f"tracks {path}: {_OTHER_FILE}") from error
     format, read = _format_of(text, path)
     from_top = format in ("tracks-csv", "tracks-after-effects")
     shift = first_frame_of(first_number, first_frame, FORMATS[format].defaults)
@@ -157,6 +173,19 @@ def read_tracks(
     return UserTracks(tracks, sigma, plate, not from_top, f"tracks {path}", size)
 
 
+def _of_blender(path: Path, first_number: int | None, first_frame: int | None, sigma: float, on: Plate) -> UserTracks:
+    shift = first_frame_of(first_number, first_frame, FORMATS["tracks-blender"].defaults)
+    try:
+        clip = blender_tracks(path)
+        tracks = [
+            UserTrack(track.name.strip(), track.frames - shift, track.xy - PIXEL_CENTER, track.weight)
+            for track in clip.tracks
+        ]
+    except InputError as error:
+        raise InputError(f"tracks {path}: {error}") from error
+    return UserTracks(tracks, sigma, on, source=f"tracks {path}", size=clip.size, notes=clip.notes)
+
+
 def _format_of(text: str, path: Path) -> tuple[str, Callable[[str], _Curves]]:
     start = text.lstrip()
     if re.search(r"^\s*Tracker4\s*\{", text, re.MULTILINE):
@@ -169,10 +198,7 @@ def _format_of(text: str, path: Path) -> tuple[str, Callable[[str], _Curves]]:
         return "tracks-camera-tracker", _of_camera_tracker
     if "," in start.partition("\n")[0]:
         return "tracks-csv", _of_table
-    raise InputError(
-        f"tracks {path}: neither a table with track, frame, x and y, nor a script with Nuke's Tracker4, nor "
-        "CameraTracker's or 3DEqualizer's text of 2-D tracks, nor After Effects' keyframes"
-    )
+    raise InputError(f"tracks {path}: {_OTHER_FILE}")
 
 
 def _of_table(text: str) -> _Curves:

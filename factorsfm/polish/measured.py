@@ -13,6 +13,7 @@ from factorsfm.control.known import Control, LocatedControl, locate
 from factorsfm.control.with_factors import ShotFactors
 from factorsfm.frames.recorded import RecordedFootage, RecordedFrame
 from factorsfm.lens.camera_model import distortion_of
+from factorsfm.lens.lens import Lens
 from factorsfm.lens.rolling_shutter import Recording
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.polish.polish import polish
@@ -42,6 +43,7 @@ class MeasuredShot:
         supervised: tracks that the user vouches for.
         control: what is known beforehand.
         notes: sentences on what happened while the frames came.
+        solved_lens: what an earlier solve has found of an unknown lens, where the estimate of it starts; None: nothing.
     """
 
     frames: Sequence[RecordedFrame]
@@ -58,6 +60,7 @@ class MeasuredShot:
     options: Options
     control: Control | None
     notes: tuple[str, ...] = ()
+    solved_lens: Lens | None = None
 
     def solved(
         self,
@@ -94,6 +97,7 @@ class MeasuredShot:
             recording=self._recording(),
             suspects=self.suspects,
             supervised=self.supervised,
+            solved_lens=self.solved_lens,
             in_time=True,
         )
 

@@ -23,6 +23,7 @@ from factorsfm.adjustment.track_errors import TrackErrors, measure_track_errors
 from factorsfm.control.known import LocatedControl
 from factorsfm.control.solve import Controlled, frames_under_control, solve_under_control
 from factorsfm.control.with_factors import ShotFactors, solve_with_factors
+from factorsfm.lens.lens import Lens
 from factorsfm.lens.rolling_shutter import Recording, seen_at_once
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.motion.stretches import Stretch, stretches
@@ -61,6 +62,7 @@ def polish(
     recording: Recording | None = None,
     suspects: Index | None = None,
     supervised: SupervisedTracks | None = None,
+    solved_lens: Lens | None = None,
     *,
     in_time: bool = False,
 ) -> Polished:
@@ -77,6 +79,7 @@ def polish(
             or in no order of time.
         suspects: ids (ascending) of tracks that count only where they agree with the others.
         supervised: tracks of which the errors are known, and that take part however well they fit.
+        solved_lens: see `MeasuredShot`.
         in_time: whether the images were recorded one after another, so that a lens may have zoomed over them.
         control: known poses, points and lengths; it takes part at the end, and only where the camera moves.
         factors: of the caller, where there is no control; they take part as it does.
@@ -87,8 +90,9 @@ def polish(
             world is.
     """
     shot = Shot.of(
-        images, map_points, focal, shape, groups, first_focal, recording, suspects, supervised, in_time=in_time
-    )
+        images, map_points, focal, shape, groups, first_focal, recording, suspects, supervised, solved_lens,
+        in_time=in_time,
+    )  # fmt: skip
     named = _named(shot, control, factors, options.polish.max_frames // 2)
     start, frames, left_out = _start(shot, options, named, progress)
     progress("polish: all tracks")

@@ -34,6 +34,7 @@ class Shot:
         recording: of which the images are all, None if their rows were all read at once.
         suspects: ids (ascending) of the tracks that take part only where they agree with the others.
         supervised: tracks that take part whatever the others say.
+        solved_lens: see `MeasuredShot`.
         in_time: whether the images were recorded one after another.
     """
 
@@ -45,6 +46,7 @@ class Shot:
     recording: Recording | None
     suspects: Index
     supervised: SupervisedTracks
+    solved_lens: Lens | None
     in_time: bool
 
     @classmethod
@@ -59,6 +61,7 @@ class Shot:
         recording: Recording | None,
         suspects: Index | None,
         supervised: SupervisedTracks | None,
+        solved_lens: Lens | None,
         *,
         in_time: bool,
     ) -> Shot:
@@ -70,7 +73,7 @@ class Shot:
         group = np.zeros(len(images), np.int64) if groups is None else groups
         suspects = np.zeros(0, np.int64) if suspects is None else suspects
         supervised = supervised or SupervisedTracks.none()
-        return cls(images, map_points, guess, group, first_focal, recording, suspects, supervised, in_time)
+        return cls(images, map_points, guess, group, first_focal, recording, suspects, supervised, solved_lens, in_time)
 
     @property
     def registered(self) -> list[int]:

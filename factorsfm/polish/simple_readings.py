@@ -17,7 +17,7 @@ from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import ErrorModel
 from factorsfm.adjustment.state import State
 from factorsfm.lens.rolling_shutter import turns_before_shutter
-from factorsfm.lens.turning import turning_camera
+from factorsfm.lens.turning import FACTORS, turning_camera
 from factorsfm.motion.at_rest import LEAST_SHARE, Rest, at_rest, resting_share, share_explained
 from factorsfm.motion.readings import solution_from
 from factorsfm.motion.shot_kind import classify_motion
@@ -32,14 +32,17 @@ logger = logging.getLogger(__name__)
 _TURNING_PX = 2.0 * FIRST_SIGMA_PX
 
 
-def turning_reading(guess: State, few: Observations, options: Options) -> CameraSolution | None:
+def turning_reading(guess: State, few: Observations, options: Options, *, lens_solved: bool) -> CameraSolution | None:
     """The cameras on the core tracks from one that only turns, where that explains them, through an unknown lens.
 
     With a known lens the solution from the map tells; through a wrong one it takes a pan for a translation.
+
+    Args:
+        lens_solved: whether the lens of the guess is that of an earlier solve.
     """
     if not options.refine_focal_length or len(guess.log_focal) > 1:
         return None
-    start = turning_camera(guess, few, options.polish)
+    start = turning_camera(guess, few, options.polish, (1.0,) if lens_solved else FACTORS)
     sigma = typical_sigma(BundleAdjustment(start, few, options.polish, ErrorModel(1.0)).reprojection_errors())
     logger.info("a turning camera of focal length %.0f pixels leaves %.2f px", start.focal[0], sigma)
     if sigma > _TURNING_PX:

@@ -14,7 +14,7 @@ from factorsfm.adjustment.problem import FocalPrior, Free
 from factorsfm.adjustment.some_frames import seen_in, some_frames
 from factorsfm.adjustment.state import State
 from factorsfm.lens.estimate import estimate_lens
-from factorsfm.lens.lens import LensEstimate, observed_width, shape_sigmas, through
+from factorsfm.lens.lens import Lens, LensEstimate, observed_width, shape_sigmas, through
 from factorsfm.lens.rolling_shutter import Shutter, find_shutter
 from factorsfm.lens.search import FoundLens, found_lens
 from factorsfm.lens.zoom import Zoom, find_zoom, unannounced_zoom
@@ -148,9 +148,13 @@ def _solved_core(shot: Shot, frames: list[int], observations: Observations, trac
     core = trusted[core_tracks(observations.of(trusted), len(frames))]
     whole = observations.of(core)
     first = guess = _first_guess(shot, frames, whole, tracks[core], _world(observations))
-    found, search = turning_reading(guess, whole, options), None
+    search, solved = None, shot.solved_lens
+    if solved is not None:
+        search = FoundLens(Lens.of(first), Lens(solved.focal), better=True, bent=solved if solved.bends else None)
+        guess = replace(through(guess, solved.focal), lens=solved.shape)
+    found = turning_reading(guess, whole, options, lens_solved=solved is not None)
     if found is None:
-        if options.refine_focal_length and options.lens != "zoom":
+        if search is None and options.refine_focal_length and options.lens != "zoom":
             search = _searched(guess, whole, options)
             guess = through(guess, search.straight.focal) if search.better else guess
         found = unless_at_rest(best_solution(guess, whole, options), guess, whole, options)

@@ -42,6 +42,8 @@ def floor_points() -> dict[str, np.ndarray]:
 def test_the_report_writes_the_command_of_the_page(place: Path, tmp_path: Path) -> None:
     browser, walk = Chromium(tmp_path), read_walk()
     words = walkthrough.pick_in_page(browser, place / "walk" / "report.html", walk)
+    walkthrough.choose_tracks(browser)
+    assert "--without-tracks" in browser.run("byId('mend_command').value")
     browser.close()
     assert len(words) == len(walk.align)
     for word, said in zip(words, walk.align, strict=True):
@@ -78,5 +80,5 @@ def test_the_cube_stands_on_the_floor_in_every_frame(place: Path, tmp_path: Path
 
 
 def test_its_pictures_are_small() -> None:
-    for name in ("walk-view.jpg", "walk-cube.jpg"):
+    for name in ("walk-view.jpg", "walk-cube.jpg", "report-tracks.jpg"):
         assert (DOCS / "images" / name).stat().st_size < 150_000

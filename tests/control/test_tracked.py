@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from factorsfm.control.known import Control, KnownDistance, KnownPose, MarkedPoi
 from factorsfm.export import ExportOptions, export
 from factorsfm.result.reconstruction import Reconstruction
 from factorsfm.support.errors import InputError
+from tests.blender_files import in_blender, saved
 from tests.export_problems import hard_reconstruction
 
 Array = NDArray[np.float64]
@@ -69,6 +71,48 @@ def test_alembic_comes_back(tmp_path: Path, rate: float) -> None:
     (tmp_path / "control.json").write_text(json.dumps({"cameras": {"file": "a.abc", "fps": 2 * rate}}))
     doubled = [1001 + pose.frame for pose in read_control(tmp_path / "control.json").poses]
     assert doubled == [2 * (1001 + frame) for frame in FRAMES]  # what is said counts
+
+
+@in_blender
+@pytest.mark.parametrize("first", [None, 1001])
+def test_the_camera_of_a_file_of_blender_comes_back(first: int | None, tmp_path: Path) -> None:
+    reconstruction = hard_reconstruction()
+    export(reconstruction, tmp_path / "scene.py", format="blender", options=ExportOptions(first_frame=first))
+    scene = f"import runpy; runpy.run_path({str(tmp_path / 'scene.py')!r})"
+    control = read_control(saved(tmp_path, scene))
+    assert [pose.frame for pose in control.poses] == list(range(10, 21))
+    solved = replace(control, poses=[pose for pose in control.poses if pose.frame in FRAMES])
+    assert_poses(solved, reconstruction, FRAMES)
+
+
+IN_A_RIG = """
+scene, camera = bpy.context.scene, bpy.context.scene.camera
+scene.frame_start, scene.frame_end = 1, 3
+rig = bpy.data.objects.new("rig", None)
+scene.collection.objects.link(rig)
+rig.scale, rig.location, camera.parent = (2, 2, 2), (0, 0, 1), rig
+camera.constraints.new("DAMPED_TRACK").target = bpy.data.objects["Cube"]
+camera.constraints[0].track_axis = "TRACK_NEGATIVE_Z"
+for number in (1, 2, 3):
+    camera.location = (number, -4, 1)
+    camera.keyframe_insert("location", frame=number)
+"""
+
+
+@in_blender
+def test_a_camera_of_blender_is_where_parents_and_constraints_place_it(tmp_path: Path) -> None:
+    poses = read_control(saved(tmp_path, IN_A_RIG)).poses
+    assert [pose.frame for pose in poses] == [0, 1, 2]
+    for k, pose in enumerate(poses):
+        np.testing.assert_allclose(pose.position, [2 * (k + 1), -3, -8], atol=1e-6)  # z of Blender is -y
+        ahead = pycolmap.Rotation3d(np.asarray(pose.cam_from_world)).inverse() * np.array([0.0, 0.0, 1.0])
+        np.testing.assert_allclose(ahead, -np.array(pose.position) / np.linalg.norm(pose.position), atol=1e-6)
+
+
+@in_blender
+def test_a_file_of_blender_without_a_camera(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"shot\.blend: its scene has no camera"):
+        read_control(saved(tmp_path, "bpy.context.scene.camera = None"))
 
 
 def sampled(path: Path, times: list[float], rate: float | None) -> None:
@@ -331,6 +375,27 @@ def test_files_that_hold_no_camera_are_refused_in_one_sentence(
     with pytest.raises(InputError, match=message) as caught:
         read_control(tmp_path / name)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("file", ["cameras", "images", "points3D", "rigs", "frames"])
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.6, 0.999])
+def test_a_binary_model_that_is_not_whole_is_refused(file: str, share: float, tmp_path: Path) -> None:
+    export(hard_reconstruction(), tmp_path / "model", format="colmap-binary")
+    path = tmp_path / "model" / f"{file}.bin"
+    data = path.read_bytes()
+    path.write_bytes(data[: int(share * len(data))])
+    with pytest.raises(InputError, match=rf"{file}.bin of the COLMAP model in .* is not whole"):
+        read_control(tmp_path / "model")
+
+
+@pytest.mark.parametrize("count", [2**40, 2**64 - 1])
+@pytest.mark.parametrize("file", ["cameras", "images", "points3D", "rigs", "frames"])
+def test_a_count_without_an_end_is_refused(count: int, file: str, tmp_path: Path) -> None:
+    export(hard_reconstruction(), tmp_path / "model", format="colmap-binary")
+    path = tmp_path / "model" / f"{file}.bin"
+    path.write_bytes(count.to_bytes(8, "little") + path.read_bytes()[8:])
+    with pytest.raises(InputError, match=rf"{file}.bin of the COLMAP model in .* is not whole"):
+        read_control(tmp_path / "model")
 
 
 def test_a_folder_without_a_model(tmp_path: Path) -> None:

@@ -595,12 +595,13 @@ def test_the_first_frame_counts_where_the_docs_say_so(tmp_path: Path, format: st
     table = (Path(__file__).parents[2] / "docs" / "export.md").read_text()
     (said,) = re.findall(rf"^\| `{format}` \|.*\| (\S+) \|$", table, re.MULTILINE)
     footage = noise_images(tmp_path / "shot", 1) if format in ("undistorted", "tracks-blender") else None
-    written = []
+    written, reconstruction = [], hard_reconstruction()
+    if format == "stmap":  # one pair of maps has no number
+        reconstruction.frames[0].camera = reconstruction.camera
     for first_frame in (0, 500):
         path = path_of(format, tmp_path / str(first_frame))
-        export(
-            hard_reconstruction(), path, format=format, options=ExportOptions(first_frame=first_frame, footage=footage)
-        )
+        options = ExportOptions(first_frame=first_frame, footage=footage)
+        export(reconstruction, path, format=format, options=options)
         files = [file for file in sorted(path.parent.rglob("*")) if file.is_file()]
         written.append({file.relative_to(path.parent): file.read_bytes() for file in files})
     assert (written[0] != written[1]) == (said != "–")

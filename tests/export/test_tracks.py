@@ -157,8 +157,10 @@ def test_blender(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
     clip = types.SimpleNamespace(tracking=types.SimpleNamespace(tracks=types.SimpleNamespace(new=new)))
     data = types.SimpleNamespace(movieclips=types.SimpleNamespace(load=lambda path: clip))
-    monkeypatch.setitem(__import__("sys").modules, "bpy", types.SimpleNamespace(data=data))
+    context = types.SimpleNamespace(scene=types.SimpleNamespace())
+    monkeypatch.setitem(__import__("sys").modules, "bpy", types.SimpleNamespace(data=data, context=context))
     exec(compile(script, "tracks.py", "exec"), {})
+    assert context.scene.active_clip is clip
     assert clip.frame_start == FIRST  # where frame 1 of the clip is shown
     found = {
         (name, clip.frame_start - 1 + number): [marker.co[0] * WIDTH, (1 - marker.co[1]) * HEIGHT]

@@ -62,6 +62,22 @@ def test_nuke_s_focal_length_has_keys(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.ravel(list(keys.values())), focal * 24.89 / 640)
 
 
+@pytest.mark.parametrize("first", [None, 5])
+def test_maps_have_the_numbers_of_the_plates(first: int | None, tmp_path: Path) -> None:
+    reconstruction, _ = zooming("OPENCV")
+    options = ExportOptions(footage=noise_images(tmp_path / "shot", 21, name="{:02d}.png"), first_frame=first)
+    for format in ("stmap", "undistorted"):
+        export(reconstruction, tmp_path / format, format=format, options=options)
+    frames = numbers(reconstruction, first or 1001)
+    for name in ("undistort", "distort"):
+        assert sorted(path.name for path in (tmp_path / "stmap").glob(f"{name}.*")) == [
+            f"{name}.{frame:04d}.exr" for frame in frames
+        ]
+    assert {f"plate.{frame:04d}.png" for frame in frames} <= {
+        path.name for path in (tmp_path / "undistorted").iterdir()
+    }
+
+
 def test_nuke_reads_a_map_for_every_frame(tmp_path: Path) -> None:
     reconstruction, _ = zooming("OPENCV")
     export(reconstruction, tmp_path / "out", format="nuke")

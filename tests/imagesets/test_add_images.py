@@ -151,6 +151,17 @@ def test_a_result_grows_more_than_once_through_its_files(material: Set, tmp_path
     assert len(list((tmp_path / "splats" / "images").iterdir())) == 8
 
 
+def test_the_folder_of_a_shot_keeps_its_tracks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("result", "images"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "result" / "summary.json").write_text('{"program": "factorsfm"}')
+    (tmp_path / "result" / "tracks.npz").write_bytes(b"tracks")
+    folder = str(tmp_path / "result")
+    assert cli.main(["extend", folder, str(tmp_path / "images"), "--output", f"{folder}/../result"]) == 2
+    assert_error(capsys.readouterr(), "the output folder is that of the result, whose tracks")
+    assert (tmp_path / "result" / "tracks.npz").read_bytes() == b"tracks"
+
+
 def test_frames_of_a_video_are_added_and_exported_in_a_folder_of_its_name(material: Set, tmp_path: Path) -> None:
     height, width = material.shot.images[0].shape[:2]
     video = cv2.VideoWriter(str(tmp_path / "clip.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 24, (width, height))

@@ -21,6 +21,7 @@ from factorsfm.lens.certainty import _left_out_covariance, lens_covariances
 from factorsfm.lens.lens import Lens, LensEstimate, through
 from factorsfm.lens.search import search_lens
 from factorsfm.lens.solver import LensSolver
+from factorsfm.polish import start
 from factorsfm.polish.camera_starts import _everywhere
 from factorsfm.polish.polish import polish
 from factorsfm.result.notes import lens_note
@@ -33,7 +34,7 @@ BARREL = np.array([-0.15, 0.02, 0.0, 0.0, 0.0, 0.0])
 STRONG_BARREL = np.array([-0.3, 0.08, 0.0, 0.0, 0.0, 0.0])
 
 
-def estimated(problem, *, guess=1.3, shape=None, lens="distortion", first_std=None):
+def estimated(problem, *, guess=1.3, shape=None, lens="distortion", first_std=None, solved_lens=None):
     """The polish of a problem whose lens has a shape, from tracks that a guess normalised without it."""
     wrong = np.array([guess * problem.focal])
     start = through(problem.truth, wrong)
@@ -41,13 +42,27 @@ def estimated(problem, *, guess=1.3, shape=None, lens="distortion", first_std=No
     points = np.arange(len(start.bearing)), start.points
     options = replace(Options.preset_named("geometry"), lens=lens)
     first = None if first_std is None else (wrong, first_std)
-    return polish(images, points, wrong, options, first_focal=first)
+    return polish(images, points, wrong, options, first_focal=first, solved_lens=solved_lens)
 
 
 def seen_through(problem, shape):
     """The problem with distorted observations."""
     pixels = problem.focal * distort(problem.xy, shape)[0]
     return replace(problem, observations=replace(problem.observations, pixels=pixels))
+
+
+@pytest.mark.parametrize("shape", [None, BARREL, STRONG_BARREL])
+def test_what_an_earlier_solve_has_found_is_refined_without_a_search(shape, monkeypatch):
+    problem = make_problem("arc", frames=12, points=300, parallax=0.3, noise_px=0.3)
+    first = estimated(problem, shape=shape).lens
+    assert first.determined
+    monkeypatch.setattr(start, "_searched", lambda *arguments: pytest.fail("the lens was searched"))
+    again = estimated(problem, shape=shape, solved_lens=first.lens).lens
+    assert again.determined
+    assert again.lens.bends == first.lens.bends == (shape is not None)
+    assert np.log(again.lens.focal / first.lens.focal) == pytest.approx(0.0, abs=0.1 * first.focal_std[0])
+    np.testing.assert_allclose(again.focal_std, first.focal_std, rtol=0.02)
+    np.testing.assert_allclose(again.lens.shape, first.lens.shape, atol=2e-3)
 
 
 def assert_derivative(analytic, function, size, step=1e-6):

@@ -22,12 +22,15 @@ from factorsfm import (
     Stream,
     solve_again,
 )
+from factorsfm.camera.projection import with_focal
 from factorsfm.cli.main import main
+from factorsfm.polish import start
 from factorsfm.report.thumbnails import thumbnail
 from factorsfm.result.alignment import FREE_SCALE, Alignment
 from factorsfm.result.other_world import in_other_world
 from factorsfm.result.tracks_file import read_tracks, write_tracks
 from factorsfm.support.similarity import Similarity
+from factorsfm.synthetic import render_shot
 from tests.command_line import assert_error
 from tests.rendered import FRAMES, Maps, rendered, simulated_maps, with_fewer_tracks
 
@@ -100,6 +103,35 @@ def test_without_a_change_the_cameras_are_the_same(result: Reconstruction, folde
     assert again.notes == result.notes
     assert again.frames[1].covariance == pytest.approx(result.frames[1].covariance, rel=1e-3)
     assert (again.frames[0].prior is None) == (result.frames[0].prior is None)
+
+
+@pytest.fixture(scope="module")
+def unknown(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A result whose lens was estimated."""
+    folder = tmp_path_factory.mktemp("unknown")
+    shot = render_shot("arc", 12, 320, 180, parallax=0.3)
+    images = [Frame(k, image, f"{k:06d}", k / 24) for k, image in enumerate(shot.images)]
+    factorsfm.reconstruct(images, depth=None).write(folder)
+    return folder
+
+
+def test_a_lens_is_searched_where_what_was_found_leads_to_none(unknown: Path) -> None:
+    known, wrong = factorsfm.read_result(unknown), factorsfm.read_result(unknown)
+    wrong.camera = with_focal(wrong.camera, 30.0 * wrong.camera.mean_focal_length())
+    solved = solve_again(wrong)
+    assert solved.camera.mean_focal_length() == pytest.approx(known.camera.mean_focal_length(), rel=1e-6)
+
+
+def test_an_unknown_lens_starts_where_it_was_found(unknown: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    known = factorsfm.read_result(unknown)
+    assert known.lens is not None
+    assert known.lens.focal_std is not None
+    monkeypatch.setattr(start, "_searched", lambda *arguments: pytest.fail("the lens was searched"))
+    solved = solve_again(known, mask_regions=["0,0,40,40"])
+    assert solved.lens is not None
+    off = np.log(solved.camera.mean_focal_length() / known.camera.mean_focal_length())
+    assert abs(off) < 0.5 * known.lens.focal_std
+    assert solved.lens.focal_std == pytest.approx(known.lens.focal_std, rel=0.3)
 
 
 def test_tracks_regions_and_frames_are_left_out(result: Reconstruction, folder: Path, tmp_path: Path) -> None:

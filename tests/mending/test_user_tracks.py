@@ -6,6 +6,7 @@ import math
 import re
 import shlex
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.track_errors import measure_track_errors
 from factorsfm.cli.main import main
 from factorsfm.export import export
-from factorsfm.mending.joined import on_footage
+from factorsfm.mending.joined import joined, on_footage
 from tests.command_line import assert_error
 from tests.exact_result import build
 from tests.exported_files import after_effects_tracks, nuke_curves, nuke_nodes
@@ -165,6 +166,12 @@ def test_files_that_cannot_be_read(text: str, words: str, tmp_path: Path) -> Non
         read_tracks(tmp_path / "tracks.txt")
 
 
+def test_a_file_that_is_no_text_is_told_what_is_read(tmp_path: Path) -> None:
+    (tmp_path / "shot.mp4").write_bytes(bytes(range(256)))
+    with pytest.raises(InputError, match=r"shot\.mp4: neither a table.* nor a \.blend file"):
+        read_tracks(tmp_path / "shot.mp4")
+
+
 @pytest.mark.parametrize(
     ("tracks", "words"),
     [
@@ -173,6 +180,7 @@ def test_files_that_cannot_be_read(text: str, words: str, tmp_path: Path) -> Non
         (lambda: UserTracks([a_track()], sigma=0.0), "standard deviation of the tracks is 0"),
         (lambda: UserTracks([a_track()], on="plate"), 'lie on "plate"'),
         (lambda: a_track(frames=[2, 1]), "do not ascend"),
+        (lambda: replace(a_track(), weight=0.0), 'the weight of track "a" is 0; 0.001 to 1000 is expected'),
         (lambda: a_track(frames=[1]), "of shape"),
         (lambda: a_track(frames=[1, 2.5]), 'track "a" has a place or a frame that is none'),
         (lambda: a_track(frames=[1, math.nan]), 'track "a" has a place or a frame that is none'),
@@ -246,6 +254,16 @@ def tracks(result: Reconstruction) -> UserTracks:
             xy += np.outer(np.sin(np.linspace(0, 3, FRAMES)), rng.choice([-12, 12], 2))
         found.append(UserTrack(name, np.arange(FRAMES), xy))
     return UserTracks(found, sigma=0.3)
+
+
+def test_a_weight_divides_the_standard_deviation_and_notes_of_a_file_are_kept(
+    result: Reconstruction, tracks: UserTracks
+) -> None:
+    assert result.measured is not None
+    weighed = [replace(track, weight=weight) for track, weight in zip(tracks.tracks[:2], (0.5, 2.0), strict=True)]
+    found = joined(result.measured, UserTracks(weighed, sigma=0.3, notes=["One is left out."]))
+    assert found.supervised.sigma.tolist() == [0.6, 0.15]
+    assert found.notes[-1] == "One is left out."
 
 
 def write_table(tracks: UserTracks, path: Path) -> None:
@@ -396,7 +414,9 @@ def test_a_track_that_cannot_be_placed_is_named(result: Reconstruction, tracks: 
         "Supervised tracks without a point, since the solved frames do not place it: window 9.",
         "Of the tracks, 1 of 4 have no frame of the shot.",
     ]
-    with pytest.raises(InputError, match="no track has two frames of the shot; its frames are 0 to 7"):
+    with pytest.raises(
+        InputError, match=r"no track has two frames of the shot; its frames are 0 to 7.*--tracks-first-frame"
+    ):
         solve_again(result, tracks=UserTracks([once, never]))
 
 
