@@ -26,7 +26,9 @@ Index = NDArray[np.int64]
 
 logger = logging.getLogger(__name__)
 
-_DOUBTFUL_INFLATION = 8.0  # see `error_inflation`; right solutions have 1 to 6, wrong ones 13 to 80
+# See `error_inflation` and `shared_error`: right solutions have 1 to 6, wrong ones 13 to 80, and right ones of long
+# tracks 15, with 0.007 pixels in common. Wrong ones that lie nearest have 0.017.
+_DOUBTFUL_INFLATION, _LEAST_SHARED_PX = 8.0, 0.01
 _CLEARLY = 0.9  # of the cost of the solution from the incremental map, below which another one is preferred
 _ROUGH = 1e-3  # relative decrease of the cost with which a try ends: the right one costs far less than the others
 _ROUNDS = 3  # in which what moves is left out
@@ -120,7 +122,9 @@ def _converged(found: CameraSolution, known: CameraSolution, options: Options) -
 
 def is_doubtful(solved: BundleAdjustment, options: Options) -> bool:
     """Whether the residuals say that a solution is wrong: they are large, or neighbours have them in common."""
-    return solved.sigma > options.polish.doubtful_px or solved.error_inflation() > _DOUBTFUL_INFLATION
+    if solved.sigma > options.polish.doubtful_px:
+        return True
+    return solved.error_inflation() > _DOUBTFUL_INFLATION and solved.shared_error() > _LEAST_SHARED_PX
 
 
 def _of_one_scene(known: CameraSolution, start: State, few: Observations, options: Options) -> CameraSolution:

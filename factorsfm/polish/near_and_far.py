@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.prior_term import LEAST_CORRELATION, WeighedPrior, weigh_prior
 from factorsfm.adjustment.problem import ErrorModel
+from factorsfm.adjustment.some_frames import on_some_frames
 from factorsfm.motion.readings import reversed_scene, solution_from
 from factorsfm.polish.camera_starts import Index
 from factorsfm.support.options import Options
@@ -58,14 +59,15 @@ def near_and_far(
     correlation = prior.weight.correlation
     if correlation >= 0.0:
         return NearAndFar(solved, None, correlation)
-    other = solution_from(reversed_scene(solved.state), solved.observations, options.polish)
-    loss = _cost(other, solved.sigma) - _cost(solved, solved.sigma)
+    for part in (on_some_frames(solved), solved):  # more frames only add to what the images say against it
+        other = solution_from(reversed_scene(part.state), part.observations, options.polish)
+        loss = _cost(other, solved.sigma) - _cost(part, solved.sigma)
+        logger.info("the prior says the opposite; the reversed scene costs %.1f more", loss / inflation)
+        if loss >= _PRIOR_DECIDES * inflation:
+            return NearAndFar(solved, None, correlation)
     again = weigh_prior(other, other.observations, tracks, images, inflation)
     fits = again is not None and again.weight.correlation >= LEAST_CORRELATION
-    logger.info("the prior says the opposite; the reversed scene costs %.1f more", loss / inflation)
-    if fits and loss < _PRIOR_DECIDES * inflation:
-        return NearAndFar(other, again)
-    return NearAndFar(solved, None, correlation)
+    return NearAndFar(other, again) if fits else NearAndFar(solved, None, correlation)
 
 
 def _cost(adjustment: BundleAdjustment, sigma: float) -> float:
