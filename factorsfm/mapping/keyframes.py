@@ -19,6 +19,7 @@ _LEAST_SHARED = 0.7  # of the tracks of the last keyframe; with fewer, a new one
 _SETTLED, _SETTLED_DELAY = 5, 1.0 / 12.0  # keyframes of a map that changes little; how much longer it waits, seconds
 # Ratios of the spread of the errors, and of the share of tracks that agree, to those of the best of so many images
 # before. In a map that changes little nearly all agree: there, that fewer do is enough.
+# At 1.2 no image would pass: every one would be a keyframe.
 _ROUGH, _CONTRADICTED, _LATELY = 1.5, 0.85, 5
 
 
