@@ -82,6 +82,7 @@ class MapCopy:
         focal: pixels; refine_focal: whether it is a guess.
         added: the caller's factors that the graph has taken; offered: those that wait.
         unit: how many times as long lengths are as when the map began; unit_held: whether the factors determine it.
+        asks_odds: whether `share_at_odds` is wanted.
     """
 
     keyframes: list[MappedImage]
@@ -93,6 +94,7 @@ class MapCopy:
     offered: tuple[AddedFactors, ...] = ()
     unit: float = 1.0
     unit_held: bool = False
+    asks_odds: bool = False
 
     @property
     def newest(self) -> MappedImage:

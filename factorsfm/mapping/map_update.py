@@ -16,7 +16,7 @@ from factorsfm.graph.keyframe_graph import KeyframeGraph, UpdateResult
 from factorsfm.graph.live_isam import YOUNG
 from factorsfm.graph.unit_of_length import unit_of_length
 from factorsfm.graph.window import Window
-from factorsfm.mapping.at_odds import EVERY, share_at_odds, share_left_out
+from factorsfm.mapping.at_odds import share_at_odds, share_left_out
 from factorsfm.mapping.depth_fallback import DepthGuidance
 from factorsfm.mapping.graph_window import choose_landmarks, choose_window, measured_window
 from factorsfm.mapping.landmarks import add_landmarks, mapped_landmarks, solve_alone
@@ -82,7 +82,7 @@ def _extended(copy: MapCopy, graph: KeyframeGraph) -> MapUpdate:
     if len(copy.keyframes) == 1:
         return MapUpdate(position, depth, True, "the first keyframe", affines=affine)
     images, constant = choose_window(copy.keyframes, copy.named_frames)
-    at_odds = share_at_odds(images, copy.points, copy.focal, o) if len(copy.keyframes) % EVERY == 0 else None
+    at_odds = share_at_odds(images, copy.points, copy.focal, o) if copy.asks_odds else None
     add_landmarks(copy, images, guidance)
     ids = mapped_landmarks(images, copy.points)
     if (seen := int(np.isin(newest.tracks.ids, ids).sum())) < o.min_inliers:

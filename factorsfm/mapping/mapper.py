@@ -16,7 +16,7 @@ from factorsfm.graph.contents import LiveGraph, graph_contents
 from factorsfm.graph.process import GraphProcess
 from factorsfm.graph.unit_of_length import unit_of_length
 from factorsfm.mapping.additions import Additions
-from factorsfm.mapping.at_odds import became_much
+from factorsfm.mapping.at_odds import EVERY, became_much
 from factorsfm.mapping.graph_updates import submit_update
 from factorsfm.mapping.incremental import IncrementalMapper
 from factorsfm.mapping.keyframes import carry, is_keyframe, suddenly_rough, update_delay
@@ -329,6 +329,7 @@ class Mapper(IncrementalMapper):
         copy = MapCopy(
             keyframes, self.points.copy(), self.options, self.focal, self._refine_focal,
             added=self.additions.active, offered=tuple(self.additions.offered), unit=self.unit,
+            asks_odds=len(keyframes) % EVERY == 0,
         )  # fmt: skip
         if self._prior.lost:
             copy = copy.without_prior()
