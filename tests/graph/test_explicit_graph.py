@@ -11,7 +11,6 @@ from gtsam.symbol_shorthand import A, L, T, X
 
 from factorsfm import Reconstruction, ShotKind, factor_graph, read_result
 from factorsfm.graph.factors import affine_of_native
-from factorsfm.lens import rolling_shutter
 from factorsfm.synthetic import Motion
 from tests.exact_result import build
 from tests.graph.results import longer_result, pose_covariance, result
@@ -118,15 +117,13 @@ def test_the_result_is_its_minimum(motion: Motion, guided: bool, most: float) ->
         assert shift == pytest.approx(prior.shift, abs=0.3 * prior.shift_std)
 
 
-def test_poses_that_are_fitted_to_a_rolling_shutter_are_its_minimum(monkeypatch: pytest.MonkeyPatch) -> None:
-    for limit in ("_LEAST_PX", "_LEAST_EVIDENCE"):  # this shot has none: any will do, since only its poses count here
-        monkeypatch.setattr(rolling_shutter, limit, 0.0)
+def test_poses_that_are_fitted_to_a_rolling_shutter_are_its_minimum() -> None:
     r = result("truck", guided=False, shutter="auto")
     assert r.shutter is not None
     assert r.shutter.recorded
     found = moved_in_deviations(r)
     assert np.abs(found).max() < 0.01
-    assert 0.5 < np.abs(moved_in_deviations(replace(r, rolled=None))).max() < 10.0
+    assert 1.0 < np.abs(moved_in_deviations(replace(r, rolled=None))).max() < 10.0
 
 
 def moved_in_deviations(r: Reconstruction) -> np.ndarray:
