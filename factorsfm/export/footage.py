@@ -69,7 +69,7 @@ def background(shot: Shot) -> Path | Sequence | None:
         return None
     try:
         found, held = _movie(path, shot.fields) if path.is_file() else _numbered(path)
-        if isinstance(found, Sequence) and _are_photographs(shot):
+        if isinstance(found, Sequence) and shot.are_photographs:
             _check_photographs(shot, found)
     except InputError as error:
         if shot.options.footage is not None:
@@ -94,11 +94,6 @@ def _numbered(folder: Path) -> tuple[Sequence, range]:
     """The images in a folder, and the numbers from the first to the last."""
     sequence = image_sequence(folder)
     return sequence, range(sequence.first, sequence.last + 1)
-
-
-def _are_photographs(shot: Shot) -> bool:
-    """Whether these are images in any order: counted from 0, turned and scaled to the format of their cameras."""
-    return bool(shot.reconstruction.options.get("unordered"))
 
 
 def _check_photographs(shot: Shot, sequence: Sequence) -> None:
@@ -167,14 +162,13 @@ def frames_of(shot: Shot, frames: Iterable[FrameResult]) -> Iterator[Frame]:
     """
     assert shot.footage is not None
     wanted = [(frame, frame.index + shot.numbering.shift) for frame in frames]
-    are_photographs = _are_photographs(shot)
-    images = _read(shot, slice(wanted[0][1], wanted[-1][1] + 1), photographs=are_photographs)
+    images = _read(shot, slice(wanted[0][1], wanted[-1][1] + 1))
     for frame, index in wanted:
         found = next((image for image in images if image.index == index), None)
         if found is None:
             raise InputError(f"{shot.footage} has no frame {index}; it is not the shot of this result")
         camera = shot.reconstruction.camera_of(frame)
-        if are_photographs:
+        if shot.are_photographs:
             found = replace(found, image=in_format_of(camera, found.image))
         height, width = found.image.shape[:2]
         if (width, height) != (camera.width, camera.height):
@@ -185,8 +179,8 @@ def frames_of(shot: Shot, frames: Iterable[FrameResult]) -> Iterator[Frame]:
         yield found
 
 
-def _read(shot: Shot, part: slice, *, photographs: bool) -> Iterator[Frame]:
+def _read(shot: Shot, part: slice) -> Iterator[Frame]:
     assert shot.footage is not None
-    if not photographs:
+    if not shot.are_photographs:
         return read_frames(shot.footage, part, fields=shot.fields)
     return (image for image in read_images(shot.footage, part) if isinstance(image, Frame))

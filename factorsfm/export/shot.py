@@ -146,6 +146,11 @@ class Shot:
         """Number of the first frame of the footage."""
         return self.first_frame + self.numbering.footage_first - self.numbering.shift
 
+    @property
+    def are_photographs(self) -> bool:
+        """Whether these are images in any order: counted from 0, turned and scaled to the format of their cameras."""
+        return bool(self.reconstruction.options.get("unordered"))
+
     @cached_property
     def in_footage(self) -> list[FrameResult]:
         """The frames that the footage holds: not those of images that were added to the result."""

@@ -115,7 +115,6 @@ class _Writer:
     ) -> None:
         self._shot, self._folder, self._given, self._masks = shot, folder, given, masks
         self._new = {frame.index: (frame.name, new.camera_of(frame)) for frame in new.registered}
-        self._are_photographs = bool(shot.reconstruction.options.get("unordered"))
         self._lens: pycolmap.Camera | None = None  # that the straightening is for
         self._straightening: Straightening | None = None
 
@@ -132,10 +131,10 @@ class _Writer:
         bends = self._shot.options.undistorted and distorts(lens)
         target = self._folder / IMAGES / name
         copied = path is not None and not bends and path.suffix == target.suffix and not _is_turned(path)
-        if path is not None and (not copied or self._masks or self._are_photographs):
+        if path is not None and (not copied or self._masks or self._shot.are_photographs):
             image = read_image(path)
         stored = image
-        if image is not None and self._are_photographs:
+        if image is not None and self._shot.are_photographs:
             image = in_format_of(lens, image)  # turned and scaled as it was solved
             copied = copied and image is stored
         if image is not None and image.shape[:2] != (lens.height, lens.width):
@@ -163,7 +162,7 @@ class _Writer:
         moving = moving_mask(self._shot.reconstruction, frame, Frame(frame.index, image, frame.name))
         if given is None:
             return moving
-        if self._are_photographs:
+        if self._shot.are_photographs:
             lens = self._shot.reconstruction.camera_of(frame)
             given = in_format_of(lens, 255 * given.astype(np.uint8)) > 127
         return moving | given

@@ -59,7 +59,9 @@ def near_and_far(
     correlation = prior.weight.correlation
     if correlation >= 0.0:
         return NearAndFar(solved, None, correlation)
-    for part in (on_some_frames(solved), solved):  # more frames only add to what the images say against it
+    few = on_some_frames(solved)
+    parts = [few, solved] if len(few.state.rotation) < len(solved.state.rotation) else [solved]
+    for part in parts:  # more frames only add to what the images say against it
         other = solution_from(reversed_scene(part.state), part.observations, options.polish)
         loss = _cost(other, solved.sigma) - _cost(part, solved.sigma)
         logger.info("the prior says the opposite; the reversed scene costs %.1f more", loss / inflation)
