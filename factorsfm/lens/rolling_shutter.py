@@ -43,6 +43,9 @@ _CLEARLY = 3.0  # ... and an estimate has an error, in standard deviations
 _LEAST_STEP = 0.03  # frames, of the first Newton step: a shorter readout does not matter
 _TURNING_GAIN = 10.0  # of translation, as in `Motion`, below which the camera may only turn
 _ROUGH = 1e-3  # relative decrease of the cost, with which few frames tell a clear translation from none
+# What it explains beyond what poses and points do. A camera that trucks at a constant speed hides a shutter along the
+# rows altogether; what errors of tracks have in common then passes for one of 0.003 pixels. Real ones explain 0.025 up.
+_LEAST_PX = 0.01
 _LEAST_EVIDENCE = 16.0  # squared standard deviations; an actor without a mask reaches 10
 _FEWEST, _ROUNDS = 12, 4  # least number of tracks for a field of accelerations; re-weightings
 _FITS = 5  # Gauss-Newton steps to the cameras of the recorded images, which are near
@@ -107,29 +110,39 @@ def with_sweep(
         tracks: (n,) id of each point; images: all those of the recording; frames: which of them are those of the
             observations; focal: (k,) of these, with which the observations were gathered.
     """
-    gaps = [1, *np.diff(recording.times).tolist(), 1]
+    gaps = np.pad(np.diff(recording.times), 2, constant_values=1.0)
     motion, acceleration, place = (np.zeros_like(observations.pixels) for _ in range(3))
     by_frame = observations.rows_by_frame(len(frames))
     for k, (position, rows) in enumerate(zip(frames, by_frame, strict=True)):
         ids = tracks[observations.point[rows]]
-        before, here, after = (float(focal[k]) * _seen(images, position + step, ids) for step in (-1, 0, 1))
-        velocities = (here - before) / gaps[position], (after - here) / gaps[position + 1]
-        place[rows] = here * recording.stretch / (recording.width, recording.height)
-        motion[rows], acceleration[rows] = _motion(*velocities, gaps[position], gaps[position + 1], place[rows])
+        seen = np.stack([float(focal[k]) * _seen(images, position + step, ids) for step in range(-2, 3)])
+        around = gaps[position : position + 4]
+        place[rows] = seen[2] * recording.stretch / (recording.width, recording.height)
+        motion[rows], acceleration[rows] = _motion(np.diff(seen, axis=0) / around[:, None, None], around, place[rows])
     return replace(observations, sweep=Sweep(motion, acceleration, place))
 
 
-def _motion(to: Array, on: Array, time_to: float, time_on: float, place: Array) -> tuple[Array, Array]:
-    """(n, 2) motion and acceleration in an image, from the velocities before and after it, NaN where there is none.
+def _motion(velocity: Array, time: Array, place: Array) -> tuple[Array, Array]:
+    """(n, 2) motion and acceleration in an image, without the error of the very observation that they are to explain.
 
-    The acceleration is smooth over the image: that of a single track would contain the error of the very observation
-    that it is to explain. A track of a single image does not move.
+    The motion is that between the images before and after; at the end of a track it follows from the two images beyond,
+    and only where these do not see it from this image, too. The acceleration is smooth over the image. A track of a
+    single image does not move.
+
+    Args:
+        velocity: (4, n, 2) between five images, of which this one is in the middle, NaN where one of two is missing;
+        time: (4,) between these images.
     """
-    change = 2.0 * (on - to) / (time_to + time_on)
-    acceleration = _smooth(change, place)
-    motion = np.where(np.isnan(to), on - 0.5 * time_on * acceleration, to + 0.5 * time_to * acceleration)
-    both = np.isfinite(change[:, 0])
-    motion[both] = ((to * time_on + on * time_to) / (time_to + time_on))[both]
+    _, to, on, _ = velocity
+    acceleration = _smooth(2.0 * (on - to) / (time[1] + time[2]), place)
+    motion = (to * time[2] + on * time[1]) / (time[1] + time[2])
+    for end, away in (
+        (velocity[3], -time[2] - 0.5 * time[3]),
+        (velocity[0], time[1] + 0.5 * time[0]),
+        (on, -0.5 * time[2]),
+        (to, 0.5 * time[1]),
+    ):
+        motion = np.where(np.isnan(motion), end + away * acceleration, motion)
     still = np.isnan(motion)
     return np.where(still, 0.0, motion), np.where(still, 0.0, acceleration)
 
@@ -171,7 +184,16 @@ def find_shutter(adjustment: BundleAdjustment, motion: Motion, options: Options)
     if motion.kind is ShotKind.ROTATION:
         return None
     moving = _solved_with_readout(adjustment, adjustment.state, options, moves=True)
-    return None if moving is None else _believed(moving, adjustment.state)
+    if moving is None or _explained_px(moving, adjustment) < _LEAST_PX:
+        return None
+    return _believed(moving, adjustment.state)
+
+
+def _explained_px(solved: BundleAdjustment, without: BundleAdjustment) -> float:
+    """Root mean square of what a shutter explains of the errors of a solution without one."""
+    beside = BundleAdjustment(solved.state, without.observations, without.options, without.errors)
+    gain = float((without.observation_costs() - beside.observation_costs()).sum())
+    return without.sigma * float(np.sqrt(max(gain, 0.0) / len(without.observations.frame)))
 
 
 def turns_before_shutter(adjustment: BundleAdjustment, motion: Motion, options: Options) -> BundleAdjustment | None:

@@ -15,7 +15,6 @@ from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.marginals import Marginals
 from factorsfm.adjustment.shared_errors import SharedErrors
 from factorsfm.polish import polish
-from factorsfm.support.options import ShutterUse
 from factorsfm.synthetic import Motion, render_shot
 from tests.rendered import Maps, rendered, simulated_maps, with_fewer_tracks
 
@@ -34,10 +33,10 @@ def nothing_shared(adjustment: BundleAdjustment, marginals: Marginals) -> Shared
 
 
 @cache
-def result(motion: Motion, guided: bool = True, shutter: ShutterUse = "global") -> Reconstruction:
+def result(motion: Motion, guided: bool = True) -> Reconstruction:
     shot = rendered(motion)
     prior = Maps(simulated_maps(motion)) if guided else None
-    stream = Stream(shot.camera, depth=prior, options=replace(with_fewer_tracks(Options()), shutter=shutter))
+    stream = Stream(shot.camera, depth=prior, options=replace(with_fewer_tracks(Options()), shutter="global"))
     for image in shot.images:
         stream.push(image)
     with tracks_one_by_one():
@@ -49,6 +48,17 @@ def longer_result() -> Reconstruction:
     """Longer than the time for which the errors of tracks persist."""
     shot = render_shot("dolly", 40, 320, 180)
     stream = Stream(shot.camera, options=replace(with_fewer_tracks(Options(), 120), shutter="global"))
+    for image in shot.images:
+        stream.push(image)
+    with tracks_one_by_one():
+        return stream.finish()
+
+
+@cache
+def rolling_result() -> Reconstruction:
+    """Of images whose rows were read one after another; its poses are fitted to them."""
+    shot = render_shot("handheld", 16, 320, 180, parallax=0.05, readout=0.8)
+    stream = Stream(shot.camera, options=with_fewer_tracks(Options(), 120))
     for image in shot.images:
         stream.push(image)
     with tracks_one_by_one():

@@ -13,7 +13,7 @@ from factorsfm import Reconstruction, ShotKind, factor_graph, read_result
 from factorsfm.graph.factors import affine_of_native
 from factorsfm.synthetic import Motion
 from tests.exact_result import build
-from tests.graph.results import longer_result, pose_covariance, result
+from tests.graph.results import longer_result, pose_covariance, result, rolling_result
 from tests.rendered import FRAMES
 
 
@@ -117,13 +117,13 @@ def test_the_result_is_its_minimum(motion: Motion, guided: bool, most: float) ->
         assert shift == pytest.approx(prior.shift, abs=0.3 * prior.shift_std)
 
 
-def test_poses_that_are_fitted_to_a_rolling_shutter_are_its_minimum() -> None:
-    r = result("truck", guided=False, shutter="auto")
+def test_poses_that_are_fitted_to_a_rolling_shutter_are_nearly_its_minimum() -> None:
+    r = rolling_result()
     assert r.shutter is not None
     assert r.shutter.recorded
-    found = moved_in_deviations(r)
-    assert np.abs(found).max() < 0.01
-    assert 1.0 < np.abs(moved_in_deviations(replace(r, rolled=None))).max() < 10.0
+    # The same errors have other derivatives at the poses of the recorded images than at those of the middle row.
+    assert 0.1 < np.abs(moved_in_deviations(r)).max() < 0.5
+    assert 50.0 < np.abs(moved_in_deviations(replace(r, rolled=None))).max() < 120.0
 
 
 def moved_in_deviations(r: Reconstruction) -> np.ndarray:

@@ -242,7 +242,7 @@ def test_a_camera_that_turns_does_not_seem_to_move(lens, guess, focals):
         assert result.shutter.readout[1] == pytest.approx(0.9, abs=0.03)
     assert 0.002 < wrong_by(found, problem)[0] < 0.01
     estimated = [] if found.lens is None else found.lens.lens.focal.tolist()
-    assert estimated == pytest.approx(focals * [problem.focal], rel=1e-4)
+    assert estimated == pytest.approx(focals * [problem.focal], rel=1e-3)  # other seeds: 3.4e-4, root mean square
 
 
 @pytest.mark.parametrize(
