@@ -5,7 +5,7 @@
 Measured are the numbers that the modules of the product name in capitals, and those of its options; a pair or triple of
 numbers changes as a whole. One that no function names which these shots run is not measured. Every measurement runs in
 a process of its own and is kept in sensitivity.json beside the table, so that an interrupted run goes on where it
-stopped.
+stopped. What costs much on the slice is measured on all studio shots, too: there chance is smaller.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ import numpy as np
 import factorsfm
 from benchmarks.inputs import open_prior, open_shot
 from benchmarks.markdown import table
-from benchmarks.plan import FULL
+from benchmarks.plan import FULL, STUDIO
 from benchmarks.run import HERE, machine
 from factorsfm import MaskFolder, Options, ReconstructionError, Stream
 from factorsfm.evaluation.metrics import auc, trajectory_errors
@@ -52,7 +52,10 @@ MUCH, LITTLE = 3.0, 0.5  # points of a column
 _SECONDS = 300  # of a measurement, twenty times as long as it takes
 COLUMNS = (("ATE", 0.002), ("ATE", 0.02), ("T-RPE", 0.001), ("T-RPE", 0.005), ("R-RPE", 0.02), ("R-RPE", 0.1))
 
+ON_ALL = "on all: "  # begins the keys of what is measured on all studio shots
+
 Scores = dict[str, list[float]]
+Changes = dict[str, float]
 _Found = TypeVar("_Found")
 
 
@@ -220,21 +223,34 @@ def _send(sender: Connection, work: Callable[..., object], arguments: Sequence[o
     sender.send(work(*arguments))
 
 
-def report(records: dict[str, Scores], shots: tuple[str, ...], rooms: Sequence[str]) -> str:
-    """The constants that matter, the worst first, and how many do not."""
+def losses_of(records: dict[str, Scores]) -> dict[str, list[Changes]]:
+    """By constant and factor, the largest loss in a column of each kind of poses; empty where the product cannot do."""
     base = records["unchanged"]
-    losses: dict[str, list[dict[str, float]]] = {}
+    losses: dict[str, list[Changes]] = {}
     for key, found in records.items():
-        if key != "unchanged":
+        if key != "unchanged" and not key.startswith(ON_ALL):
             changes = {name: float(np.min(np.subtract(found[name], base[name]))) for name in found}
             losses.setdefault(key.rpartition(" ")[0], []).append(changes)
+    return losses
+
+
+def worst_of(losses: dict[str, list[Changes]]) -> dict[str, float]:
+    """The largest loss of each constant that can be changed."""
+    return {name: min(min(c.values()) for c in changes) for name, changes in losses.items() if all(changes)}
+
+
+def _row(name: str, changes: list[Changes]) -> list[str]:
+    return [f"`{name}`", *(f"{c['graph']:+.1f} / {c['polished']:+.1f}" for c in changes)]
+
+
+def report(records: dict[str, Scores], shots: tuple[str, ...], rooms: Sequence[str]) -> str:
+    """The constants that matter, the worst first, and how many do not."""
+    base, losses = records["unchanged"], losses_of(records)
     fixed = sorted(name for name, changes in losses.items() if not all(changes))
-    worst = {name: min(min(c.values()) for c in losses[name]) for name in losses if name not in fixed}
-    rows = [
-        [f"`{name}`", *(f"{c['graph']:+.1f} / {c['polished']:+.1f}" for c in losses[name])]
-        for name in sorted(worst, key=lambda name: worst[name])
-        if worst[name] <= -LITTLE
-    ]
+    worst = worst_of(losses)
+    header = ["constant", *(f"times {factor:g}: live / polished" for factor in FACTORS)]
+    rows = [_row(name, losses[name]) for name in sorted(worst, key=lambda name: worst[name]) if worst[name] <= -LITTLE]
+    on_all = losses_of({key.removeprefix(ON_ALL): found for key, found in records.items() if key.startswith(ON_ALL)})
     return "\n\n".join(
         [
             "# Sensitivity",
@@ -246,7 +262,9 @@ def report(records: dict[str, Scores], shots: tuple[str, ...], rooms: Sequence[s
             "Unchanged: "
             + "; ".join(f"{name} {' / '.join(f'{value:.1f}' for value in found)}" for name, found in base.items())
             + ". The largest loss in any of these columns, of the live and of the polished poses:",
-            table(["constant", *(f"times {factor:g}: live / polished" for factor in FACTORS)], rows),
+            table(header, rows),
+            f"Those that cost more than {MUCH:g} points, on the first {FRAMES} frames of all studio shots:",
+            table(header, [_row(name, changes) for name, changes in on_all.items()]),
             f"The program does not run with another: {', '.join(f'`{name}`' for name in fixed) or 'none'}.",
         ]
     )
@@ -270,16 +288,27 @@ def main() -> None:
     for constant in (c for room in arguments.rooms for c in constants(room) if c.name in met):
         if arguments.only in constant.key:
             plan |= {f"{constant.key} {factor:g}": (constant, factor) for factor in FACTORS}
-    with ThreadPoolExecutor(arguments.jobs) as pool:
-        jobs = {
-            key: pool.submit(apart, measure, constant, factor, arguments.data, shots)
-            for key, (constant, factor) in plan.items()
-            if key not in records
-        }
-        for key, job in jobs.items():
-            records[key] = job.result() or {}  # nothing: the product cannot do with that value
-            kept.write_text(json.dumps(records, indent=1))
-            print(key, records[key], flush=True)
+
+    def measured(plan: dict[str, tuple[Constant | None, float]], shots: tuple[str, ...]) -> None:
+        with ThreadPoolExecutor(arguments.jobs) as pool:
+            jobs = {
+                key: pool.submit(apart, measure, constant, factor, arguments.data, shots)
+                for key, (constant, factor) in plan.items()
+                if key not in records
+            }
+            for key, job in jobs.items():
+                records[key] = job.result() or {}  # nothing: the product cannot do with that value
+                kept.write_text(json.dumps(records, indent=1))
+                print(key, records[key], flush=True)
+
+    measured(plan, shots)
+    worst = worst_of(losses_of({key: records[key] for key in plan}))
+    costly = {name for name, loss in worst.items() if loss < -MUCH}
+    plan_on_all = {
+        ON_ALL + key: what for key, what in plan.items() if key == "unchanged" or key.rpartition(" ")[0] in costly
+    }
+    measured(plan_on_all, STUDIO)
+    plan |= plan_on_all
     text = report({key: records[key] for key in plan}, shots, arguments.rooms)
     (arguments.output / "SENSITIVITY.md").write_text(text + "\n")
     print(text)
