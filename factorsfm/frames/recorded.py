@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from factorsfm.frames.timing import are_uneven, cadence, frame_interval, frame_times
 from factorsfm.support.first_few import first_few
+from factorsfm.support.pace import USUAL_RATE
 from factorsfm.support.picture_area import PictureArea
 
 _MOST_NOTED = 3  # repeated frames that are named
@@ -82,6 +83,10 @@ class RecordedFootage:
         if self._cadence(len(frames)) is not None:
             return np.arange(len(frames), dtype=np.float64)
         return frame_times([frame.index for frame in frames], [frame.timestamp for frame in frames])
+
+    def seconds(self, frames: Sequence[_Timed]) -> NDArray[np.float64]:
+        """(n,) the same in seconds, at the usual rate where that is unknown."""
+        return self.times(frames) * (self.interval(frames) or 1.0 / USUAL_RATE)
 
     def interval(self, frames: Sequence[_Timed]) -> float:
         """Seconds in one unit of `times`, 0 if unknown."""

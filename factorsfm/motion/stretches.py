@@ -20,9 +20,11 @@ from factorsfm.motion.shot_kind import CLEAR_GAIN, Motion, classify_motion
 from factorsfm.support.options import PolishOptions
 from factorsfm.support.status import ShotKind
 
+Array = NDArray[np.float64]
+
 _Value = TypeVar("_Value")
 
-_SHORTEST = 12  # frames of a stretch: half a second, in which the slowest moves of a camera in use can be seen
+_SHORTEST = 0.5  # seconds of a stretch, in which the slowest moves of a camera in use can be seen
 _ITERATIONS = 3  # until the poses of a stretch are at their best for it alone
 _FEW = 4  # frames of a stretch that are asked first
 _MOST_BLOCKS = 24  # of a long shot, which then has longer ones
@@ -41,14 +43,16 @@ class Stretch:
     kind: ShotKind
 
 
-def stretches(solved: BundleAdjustment, whole: Motion, options: PolishOptions) -> list[Stretch]:
+def stretches(solved: BundleAdjustment, whole: Motion, seconds: Array, options: PolishOptions) -> list[Stretch]:
     """The kinds of motion of a shot in order, by rows of its frames; one stretch where it is of one kind throughout.
 
     Args:
         solved: converged over cameras and points; whole: motion of the whole shot.
+        seconds: (k,) of its frames, ascending.
     """
     frames = len(solved.state.rotation)
-    blocks = min(frames // _SHORTEST, _MOST_BLOCKS)
+    length = (seconds[-1] - seconds[0]) * frames / max(frames - 1, 1)  # until the frame after the last would come
+    blocks = min(int(round(length / _SHORTEST, 6)), frames // _FEW, _MOST_BLOCKS)
     if blocks < 2 or whole.kind is ShotKind.STATIC:
         return [Stretch(0, frames - 1, whole.kind)]
     edges = np.linspace(0, frames, blocks + 1).astype(int).tolist()

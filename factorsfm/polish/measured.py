@@ -98,7 +98,7 @@ class MeasuredShot:
             suspects=self.suspects,
             supervised=self.supervised,
             solved_lens=self.solved_lens,
-            in_time=True,
+            seconds=self.footage.seconds(self.frames),
         )
 
     def _located_control(self) -> LocatedControl | None:

@@ -63,8 +63,7 @@ def polish(
     suspects: Index | None = None,
     supervised: SupervisedTracks | None = None,
     solved_lens: Lens | None = None,
-    *,
-    in_time: bool = False,
+    seconds: Array | None = None,
 ) -> Polished:
     """Triangulate all tracks and minimise over all registered frames.
 
@@ -80,7 +79,7 @@ def polish(
         suspects: ids (ascending) of tracks that count only where they agree with the others.
         supervised: tracks of which the errors are known, and that take part however well they fit.
         solved_lens: see `MeasuredShot`.
-        in_time: whether the images were recorded one after another, so that a lens may have zoomed over them.
+        seconds: (images,) when they were recorded, one after another; None: in no order of time.
         control: known poses, points and lengths; it takes part at the end, and only where the camera moves.
         factors: of the caller, where there is no control; they take part as it does.
         joining: gives factors by the poses that images and prior alone show, where there are none before.
@@ -91,7 +90,7 @@ def polish(
     """
     shot = Shot.of(
         images, map_points, focal, shape, groups, first_focal, recording, suspects, supervised, solved_lens,
-        in_time=in_time,
+        seconds,
     )  # fmt: skip
     named = _named(shot, control, factors, options.polish.max_frames // 2)
     start, frames, left_out = _start(shot, options, named, progress)
@@ -192,15 +191,15 @@ def _solved(
         inflation=start.inflation, shared_error=start.core.adjustment.shared_error(),
         contradiction=start.depths.correlation,
     )  # fmt: skip
-    if shot.in_time:
-        result.stretches = _stretches(start.core, frames, options)
+    if shot.seconds is not None:
+        result.stretches = _stretches(start.core, frames, shot.seconds[frames], options)
     result.describe_prior(adjustment, covariance)
     return adjustment, result
 
 
-def _stretches(core: Core, frames: list[int], options: PolishOptions) -> tuple[Stretch, ...]:
+def _stretches(core: Core, frames: list[int], seconds: Array, options: PolishOptions) -> tuple[Stretch, ...]:
     """What the camera does when, by positions of the images."""
-    found = stretches(core.adjustment, core.motion, options)
+    found = stretches(core.adjustment, core.motion, seconds, options)
     ends = [frames[s.first] - 1 for s in found[1:]] + [frames[-1]]
     return tuple(Stretch(frames[s.first], end, s.kind) for s, end in zip(found, ends, strict=True))
 

@@ -35,7 +35,7 @@ class Shot:
         suspects: ids (ascending) of the tracks that take part only where they agree with the others.
         supervised: tracks that take part whatever the others say.
         solved_lens: see `MeasuredShot`.
-        in_time: whether the images were recorded one after another.
+        seconds: (images,) when they were recorded, None: in no order of time.
     """
 
     images: list[MappedImage]
@@ -47,7 +47,7 @@ class Shot:
     suspects: Index
     supervised: SupervisedTracks
     solved_lens: Lens | None
-    in_time: bool
+    seconds: Array | None
 
     @classmethod
     def of(
@@ -62,8 +62,7 @@ class Shot:
         suspects: Index | None,
         supervised: SupervisedTracks | None,
         solved_lens: Lens | None,
-        *,
-        in_time: bool,
+        seconds: Array | None,
     ) -> Shot:
         """A shot whose lens is estimated where a distortion is given: its tracks keep their distorted pixels then."""
         guess = Lens(focal)
@@ -73,7 +72,12 @@ class Shot:
         group = np.zeros(len(images), np.int64) if groups is None else groups
         suspects = np.zeros(0, np.int64) if suspects is None else suspects
         supervised = supervised or SupervisedTracks.none()
-        return cls(images, map_points, guess, group, first_focal, recording, suspects, supervised, solved_lens, in_time)
+        return cls(images, map_points, guess, group, first_focal, recording, suspects, supervised, solved_lens, seconds)
+
+    @property
+    def in_time(self) -> bool:
+        """Whether the images were recorded one after another, so that a lens may have zoomed over them."""
+        return self.seconds is not None
 
     @property
     def registered(self) -> list[int]:

@@ -36,7 +36,8 @@ def polished(motion, zoom, *, parallax, guess=1.15, max_frames=400, noise_px=0.0
     options = replace(options, polish=replace(options.polish, max_frames=max_frames))
     points = np.arange(len(start.bearing)), start.points
     focal = guess * np.exp(problem.truth.log_focal)
-    return problem, polish(mapped_images(seen, start, guess=guess), points, focal, options, in_time=True)
+    images = mapped_images(seen, start, guess=guess)
+    return problem, polish(images, points, focal, options, seconds=np.arange(len(images)) / 24)
 
 
 @pytest.mark.parametrize(("motion", "parallax"), [("arc", 0.3), ("rotation", 0.0)])

@@ -13,14 +13,13 @@ from factorsfm.support.status import ShotKind
 from tests.estimation_problems import centers, in_unit_of, make_problem, mapped_images, perturbed
 
 
-def polished(motion, parallax, noise_px=0.1):
-    problem = make_problem(motion, frames=72, points=200, parallax=parallax, noise_px=noise_px)
+def polished(motion, parallax, noise_px=0.1, *, frames=72, rate=24.0):
+    problem = make_problem(motion, frames=frames, points=200, parallax=parallax, noise_px=noise_px)
     start = perturbed(problem.truth)
     points = np.arange(len(start.bearing)), start.points
     options = replace(Options.preset_named("geometry"), lens="fixed")
-    return problem, polish(
-        mapped_images(problem, start), points, np.array([problem.focal]), options, in_time=True
-    )  # fmt: skip
+    images = mapped_images(problem, start)
+    return problem, polish(images, points, np.array([problem.focal]), options, seconds=np.arange(frames) / rate)
 
 
 @pytest.mark.parametrize("parallax", [0.1, 0.02])
@@ -51,6 +50,13 @@ def test_a_shot_that_stands_then_pans_then_moves_is_told_apart(parallax):
 def test_a_slow_move_is_one_stretch(motion, parallax, kind):
     _, result = polished(motion, parallax)
     assert result.stretches == (Stretch(0, 71, ShotKind(kind)),)
+
+
+@pytest.mark.parametrize(("rate", "count"), [(24.0, 3), (120.0, 1)])
+def test_a_stretch_lasts_long_enough_to_show_a_slow_move(rate, count):
+    """Half a second in which a hand hardly turns the camera is none where all frames together last little longer."""
+    _, result = polished("handheld", 0.002, frames=144, rate=rate)
+    assert len(result.stretches) == count
 
 
 def test_the_note_says_what_the_camera_does_when():

@@ -62,7 +62,7 @@ def polished(motion, lens, monkeypatch, few):
     guess, shape = (1.0, None) if lens == "fixed" else (1.1, np.zeros(4))  # of the focal length
     focal = np.array([problem.focal * guess])
     images = mapped_images(problem, problem.truth, guess=guess)
-    return problem.truth, polish(images, points, focal, options, shape=shape, in_time=True)
+    return problem.truth, polish(images, points, focal, options, shape=shape, seconds=np.arange(len(images)) / 24)
 
 
 @pytest.mark.parametrize("motion", ["truck", "rotation"])
