@@ -17,7 +17,8 @@ from factorsfm.camera.projection import PIXEL_CENTER, with_focal
 from factorsfm.control.known import Control, LocatedControl, locate
 from factorsfm.frames.frame import Frame, bgr_image
 from factorsfm.imagesets.cameras import describe_cameras, find_cameras
-from factorsfm.imagesets.mapper import SetMapper, for_image_sets, map_parts
+from factorsfm.imagesets.mapper import SetMapper
+from factorsfm.imagesets.parts import map_parts
 from factorsfm.imagesets.photo_folder import Photo, PhotoFolder
 from factorsfm.lens.camera_model import distortion_of, with_distortion
 from factorsfm.lens.lens import LensEstimate
@@ -89,7 +90,7 @@ class ImageSet:
         self._lens_is_open = camera is None and options.lens == "auto"
         if camera is None:
             options = options.for_unknown_lens()
-        self.options = for_image_sets(options)
+        self.options = options.for_image_sets()
         self.photos: list[Photo] = []
         self.seconds = StageSeconds()
         self.notes: list[str] = []

@@ -17,7 +17,7 @@ from factorsfm.graph.live_isam import YOUNG
 from factorsfm.graph.unit_of_length import unit_of_length
 from factorsfm.graph.window import Window
 from factorsfm.mapping.at_odds import share_at_odds, share_left_out
-from factorsfm.mapping.depth_fallback import DepthGuidance
+from factorsfm.mapping.depth_guidance import DepthGuidance
 from factorsfm.mapping.graph_window import choose_landmarks, choose_window, measured_window
 from factorsfm.mapping.landmarks import add_landmarks, mapped_landmarks, solve_alone
 from factorsfm.mapping.live_covariance import window_covariance

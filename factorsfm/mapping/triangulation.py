@@ -35,6 +35,10 @@ class Triangulation:
     inliers: NDArray[np.int64]
     angle: Array
 
+    def points(self, good: NDArray[np.bool_]) -> Array:
+        """(k, 3) those of the (n,) tracks that are good, at a positive distance."""
+        return self.bearing[good] / self.inverse_distance[good, None]
+
 
 def triangulate(
     cameras: State,
