@@ -24,6 +24,7 @@ from factorsfm.lens.camera_model import distortion_of, with_distortion
 from factorsfm.lens.lens import LensEstimate
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.polish.polish import polish
+from factorsfm.polish.shot import Shot
 from factorsfm.priors.depth import DepthPrior
 from factorsfm.priors.masks import MaskPrior
 from factorsfm.priors.read_priors import read_depth, read_mask
@@ -247,18 +248,16 @@ class ImageSet:
         options = self.options
         if self._lens_is_open and part.parallax > _WIDE_PARALLAX:
             options = replace(options, lens="all")
+        shot = Shot.of(
+            part.images,
+            part.points.all(),
+            np.array([part.focal]),
+            shape=distortion_of(camera) if options.estimates_lens else None,
+            first_focal=(np.array([part.first_focal]), first_focal_std(camera, given=self._lens_given)),
+        )
         with self.seconds.of("polish"), OneThreadEach():
             try:
-                polished = polish(
-                    part.images,
-                    part.points.all(),
-                    np.array([part.focal]),
-                    options,
-                    lambda stage: progress(stage, 0, None),
-                    distortion_of(camera) if options.estimates_lens else None,
-                    control=control,
-                    first_focal=(np.array([part.first_focal]), first_focal_std(camera, given=self._lens_given)),
-                )
+                polished = polish(shot, options, lambda stage: progress(stage, 0, None), control=control)
             except ReconstructionError as error:
                 raise self._failure(str(error), part.images) from error
         result = assemble(

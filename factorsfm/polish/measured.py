@@ -18,6 +18,7 @@ from factorsfm.lens.rolling_shutter import Recording
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.polish.polish import polish
 from factorsfm.polish.polished import Polished
+from factorsfm.polish.shot import Shot
 from factorsfm.priors.depth_map import DepthKind
 from factorsfm.support.errors import ReconstructionError
 from factorsfm.support.options import Options
@@ -83,16 +84,11 @@ class MeasuredShot:
                 f"frame {self.frames[worst.tracks.position].index}: {worst.message}"
             )
         focal, std = self.first_focal
-        return polish(
+        shot = Shot.of(
             self.images,
             self.map_points,
             np.array([self.camera.mean_focal_length()]),
-            self.options,
-            stage,
-            distortion_of(self.camera) if self.options.estimates_lens else None,
-            control=control,
-            factors=factors,
-            joining=joining,
+            shape=distortion_of(self.camera) if self.options.estimates_lens else None,
             first_focal=(np.array([focal]), std),
             recording=self._recording(),
             suspects=self.suspects,
@@ -100,6 +96,7 @@ class MeasuredShot:
             solved_lens=self.solved_lens,
             in_time=True,
         )
+        return polish(shot, self.options, stage, control=control, factors=factors, joining=joining)
 
     def _located_control(self) -> LocatedControl | None:
         if self.control is None:

@@ -23,9 +23,7 @@ from factorsfm.adjustment.track_errors import TrackErrors, measure_track_errors
 from factorsfm.control.known import LocatedControl
 from factorsfm.control.solve import Controlled, frames_under_control, solve_under_control
 from factorsfm.control.with_factors import ShotFactors, solve_with_factors
-from factorsfm.lens.lens import Lens
-from factorsfm.lens.rolling_shutter import Recording, seen_at_once
-from factorsfm.mapping.mapped_images import MappedImage
+from factorsfm.lens.rolling_shutter import seen_at_once
 from factorsfm.motion.stretches import Stretch, stretches
 from factorsfm.polish.connected_frames import connected_frames
 from factorsfm.polish.frames_between import add_frames_between, solved_frames, too_few_tracks
@@ -36,7 +34,6 @@ from factorsfm.polish.start import Core, PolishStart, polish_start
 from factorsfm.support.errors import ReconstructionError
 from factorsfm.support.options import Options, PolishOptions
 from factorsfm.support.status import ShotKind
-from factorsfm.tracks.supervised import SupervisedTracks
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -48,39 +45,17 @@ _FIRST_ITERATIONS = 2  # over all tracks, until their errors are measured
 
 
 def polish(
-    images: list[MappedImage],
-    map_points: tuple[Index, Array],
-    focal: Array,
+    shot: Shot,
     options: Options,
     progress: Callable[[str], None] = lambda stage: None,
-    shape: Array | None = None,
-    groups: Index | None = None,
+    *,
     control: LocatedControl | None = None,
     factors: ShotFactors | None = None,
     joining: Callable[[Polished], ShotFactors | None] | None = None,
-    first_focal: tuple[Array, float] | None = None,
-    recording: Recording | None = None,
-    suspects: Index | None = None,
-    supervised: SupervisedTracks | None = None,
-    solved_lens: Lens | None = None,
-    *,
-    in_time: bool = False,
 ) -> Polished:
     """Triangulate all tracks and minimise over all registered frames.
 
     Args:
-        images: at least one registered; map_points: track ids and positions of the incremental map.
-        focal: (g,) focal lengths, pixels; first guesses where the options refine them.
-        shape: (4,) distortion of the lens as in `residuals.distort` where the options refine the lens; None: the
-            cameras of the images know their distortion.
-        groups: (images,) which of the focal lengths is that of each image; None: all have the first.
-        first_focal: the focal lengths as they were known first, as in `estimate_lens`; None: `focal`.
-        recording: of which the images are all, if their rows may have been read one after another; None: all at once,
-            or in no order of time.
-        suspects: ids (ascending) of tracks that count only where they agree with the others.
-        supervised: tracks of which the errors are known, and that take part however well they fit.
-        solved_lens: see `MeasuredShot`.
-        in_time: whether the images were recorded one after another, so that a lens may have zoomed over them.
         control: known poses, points and lengths; it takes part at the end, and only where the camera moves.
         factors: of the caller, where there is no control; they take part as it does.
         joining: gives factors by the poses that images and prior alone show, where there are none before.
@@ -89,10 +64,6 @@ def polish(
         ReconstructionError: hardly any tracks are left that connect frames, or the control does not determine where its
             world is.
     """
-    shot = Shot.of(
-        images, map_points, focal, shape, groups, first_focal, recording, suspects, supervised, solved_lens,
-        in_time=in_time,
-    )  # fmt: skip
     named = _named(shot, control, factors, options.polish.max_frames // 2)
     start, frames, left_out = _start(shot, options, named, progress)
     progress("polish: all tracks")

@@ -37,6 +37,7 @@ from factorsfm.imagesets.mapper import SetMapper
 from factorsfm.imagesets.parts import map_parts
 from factorsfm.imagesets.photo_folder import Photo, PhotoFolder
 from factorsfm.polish.polish import Polished, polish
+from factorsfm.polish.shot import Shot
 from factorsfm.priors.image_depth import ImageDepth
 from factorsfm.support.similarity import pose_arrays
 from factorsfm.synthetic import RenderedShot, render_shot, render_views, room_camera
@@ -93,7 +94,7 @@ def solve(tracks: list[ImageTracks], options: Options | None = None, focal: floa
     mapper = SetMapper(tracks, focal, options)
     mapper.run()
     assert all(image.registered for image in mapper.images)
-    return polish(mapper.images, mapper.points.all(), np.array([mapper.focal]), options)
+    return polish(Shot.of(mapper.images, mapper.points.all(), np.array([mapper.focal])), options)
 
 
 def test_wide_baselines_with_wrong_matches_in_any_order() -> None:

@@ -16,6 +16,7 @@ from factorsfm.lens.lens import Lens, through
 from factorsfm.lens.rolling_shutter import Recording, Shutter, seen_at_once, with_sweep
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.polish.polish import polish
+from factorsfm.polish.shot import Shot
 from factorsfm.report.result_folder import write_folder
 from factorsfm.result.assembly import _rolling_shutter
 from factorsfm.result.notes import shutter_note
@@ -64,7 +65,7 @@ def polished(problem, *, shutter="rolling", lens="fixed", guess=1.0, **options):
     known = replace(known, polish=replace(known.polish, **options))
     points = np.arange(len(start.bearing)), start.points
     recording = Recording(WIDTH, HEIGHT, np.arange(len(images)))
-    return polish(images, points, focal, known, recording=recording if shutter != "global" else None)
+    return polish(Shot.of(images, points, focal, recording=recording if shutter != "global" else None), known)
 
 
 def wrong_by(found, problem):

@@ -8,6 +8,7 @@ import pytest
 from factorsfm import Options, Stream
 from factorsfm.lens.lens import through
 from factorsfm.polish.polish import polish
+from factorsfm.polish.shot import Shot
 from factorsfm.report.result_folder import write_folder
 from factorsfm.result.notes import _motion_notes, lens_note
 from factorsfm.result.reading import read_result
@@ -36,7 +37,7 @@ def polished(motion, zoom, *, parallax, guess=1.15, max_frames=400, noise_px=0.0
     options = replace(options, polish=replace(options.polish, max_frames=max_frames))
     points = np.arange(len(start.bearing)), start.points
     focal = guess * np.exp(problem.truth.log_focal)
-    return problem, polish(mapped_images(seen, start, guess=guess), points, focal, options, in_time=True)
+    return problem, polish(Shot.of(mapped_images(seen, start, guess=guess), points, focal, in_time=True), options)
 
 
 @pytest.mark.parametrize(("motion", "parallax"), [("arc", 0.3), ("rotation", 0.0)])

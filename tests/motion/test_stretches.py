@@ -7,6 +7,7 @@ import pytest
 
 from factorsfm.motion.stretches import Stretch
 from factorsfm.polish.polish import polish
+from factorsfm.polish.shot import Shot
 from factorsfm.result.notes import stretch_notes
 from factorsfm.support.options import Options
 from factorsfm.support.status import ShotKind
@@ -19,8 +20,8 @@ def polished(motion, parallax, noise_px=0.1):
     points = np.arange(len(start.bearing)), start.points
     options = replace(Options.preset_named("geometry"), lens="fixed")
     return problem, polish(
-        mapped_images(problem, start), points, np.array([problem.focal]), options, in_time=True
-    )  # fmt: skip
+        Shot.of(mapped_images(problem, start), points, np.array([problem.focal]), in_time=True), options
+    )
 
 
 @pytest.mark.parametrize("parallax", [0.1, 0.02])
