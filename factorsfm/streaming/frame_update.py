@@ -14,10 +14,7 @@ from factorsfm.frames.texture import BLANK_TEXTURE
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.mapping.mapper import Mapper
 from factorsfm.result.frame_results import pose_of
-from factorsfm.support.errors import InputError
 from factorsfm.support.status import FrameStatus
-
-_LEAST_SIDE = 32  # pixels: room for the patches of the tracker
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,19 +81,6 @@ class FrameUpdate:
     starts_anew: bool = False
     note: str = ""
     repeats: int | None = None
-
-
-def check_size(frame: Frame, size: tuple[int, int] | None) -> None:
-    """Refuse a frame of another size (width, height) than those before, or a first one that is too small.
-
-    Raises:
-        InputError: it is one.
-    """
-    height, width = frame.image.shape[:2]
-    if size is None and min(height, width) < _LEAST_SIDE:
-        raise InputError(f"the images have {width}x{height} pixels; at least {_LEAST_SIDE} on each side are needed")
-    if size is not None and (width, height) != size:
-        raise InputError(f"frame {frame.index} is {width}x{height}, expected {size[0]}x{size[1]} as the frames before")
 
 
 class FrameIndices:
