@@ -64,16 +64,16 @@ def polish(
         ReconstructionError: hardly any tracks are left that connect frames, or the control does not determine where its
             world is.
     """
-    named = _named(shot, control, factors, options.polish.max_frames // 2)
-    start, frames, left_out = _start(shot, options, named, progress)
+    start, frames, left_out = _start(shot, options, progress, control, factors)
     progress("polish: all tracks")
     adjustment, result = _solved(shot, start, frames, left_out, options.polish)
-    if control is not None and start.core.motion.kind is ShotKind.GENERAL:
+    moves = start.core.motion.kind is ShotKind.GENERAL
+    if control is not None and moves:
         progress("polish: control")
         _put_under_control(result, adjustment, control, shot)
-    if joining is not None and start.core.motion.kind is ShotKind.GENERAL:
+    if joining is not None and moves:
         factors = joining(result)
-    if factors is not None and start.core.motion.kind is ShotKind.GENERAL:
+    if factors is not None and moves:
         progress("polish: factors")
         _respect_factors(result, adjustment, factors, shot)
     if result.control is None and (control is not None or factors is not None):
@@ -91,12 +91,13 @@ def polish(
 
 
 def _start(
-    shot: Shot, options: Options, named: Callable[[list[int]], list[int]], progress: Callable[[str], None]
+    shot: Shot,
+    options: Options,
+    progress: Callable[[str], None],
+    control: LocatedControl | None,
+    factors: ShotFactors | None,
 ) -> tuple[PolishStart, list[int], dict[int, str]]:
     """Where the solution starts, the positions of its frames, and why others are left out.
-
-    Args:
-        named: gives those of some frames that must be solved for, since something is known of them.
 
     A frame of which hardly any track is left among those that fit the cameras is not determined: all is done again
     without it.
@@ -111,7 +112,7 @@ def _start(
                 "frames, at least 2 needed"
             )
         frames = solved_frames(shot.images, registered, o.max_frames)
-        frames = sorted({*frames, *named(registered)})
+        frames = sorted({*frames, *_named(registered, control, factors, o.max_frames // 2)})
         tracks = shot.long_tracks(frames, min(o.min_track_length, max(2, len(frames))))
         observations = shot.observations(frames, tracks)
         unconnected = _unconnected(observations.of(shot.trusted(tracks)), frames, least)
@@ -124,16 +125,14 @@ def _start(
         left_out.update(unconnected)
 
 
-def _named(
-    shot: Shot, control: LocatedControl | None, factors: ShotFactors | None, limit: int
-) -> Callable[[list[int]], list[int]]:
-    """Which of some registered frames control or factors name; of very many, some."""
+def _named(registered: list[int], control: LocatedControl | None, factors: ShotFactors | None, limit: int) -> list[int]:
+    """Which registered frames must be solved for, since control or factors name them; of very many, some."""
     if control is not None:
-        return lambda registered: frames_under_control(registered, control, limit)
+        return frames_under_control(registered, control, limit)
     names = factors.frames if factors is not None else []
     if len(names) > limit:
         names = [names[k] for k in np.linspace(0, len(names) - 1, limit).astype(int)]
-    return lambda registered: sorted({*names} & {*registered})
+    return sorted({*names} & {*registered})
 
 
 def _unconnected(observations: Observations, frames: list[int], least: int) -> dict[int, str]:
