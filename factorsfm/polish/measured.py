@@ -9,7 +9,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.control.known import Control, LocatedControl, locate
+from factorsfm.control.known import Control
+from factorsfm.control.located import LocatedControl, locate
 from factorsfm.control.with_factors import ShotFactors
 from factorsfm.frames.recorded import RecordedFootage, RecordedFrame
 from factorsfm.lens.camera_model import distortion_of

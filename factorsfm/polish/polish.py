@@ -20,7 +20,7 @@ from factorsfm.adjustment.residuals import cauchy
 from factorsfm.adjustment.shared_errors import in_scene_unit_with, shared_errors
 from factorsfm.adjustment.state import State
 from factorsfm.adjustment.track_errors import TrackErrors, measure_track_errors
-from factorsfm.control.known import LocatedControl
+from factorsfm.control.located import LocatedControl
 from factorsfm.control.solve import Controlled, frames_under_control, solve_under_control
 from factorsfm.control.with_factors import ShotFactors, solve_with_factors
 from factorsfm.lens.rolling_shutter import seen_at_once

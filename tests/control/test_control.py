@@ -32,7 +32,7 @@ from factorsfm.adjustment.problem import ErrorModel, Known
 from factorsfm.adjustment.state import State
 from factorsfm.camera.projection import PIXEL_CENTER
 from factorsfm.cli import main as cli
-from factorsfm.control.known import LocatedControl, locate
+from factorsfm.control.located import LocatedControl, locate
 from factorsfm.control.residuals import (
     ALIGNMENT,
     ControlTerm,

@@ -32,10 +32,11 @@ from factorsfm.export import export
 from factorsfm.frames.unordered import Unusable, looks_unordered, other_files, read_images
 from factorsfm.imagesets.cameras import find_cameras
 from factorsfm.imagesets.covisibility import common_tracks, longest_tracks, pyramid_score
-from factorsfm.imagesets.image_set import ImageSet, _by_reason
+from factorsfm.imagesets.image_set import ImageSet
 from factorsfm.imagesets.mapper import SetMapper
 from factorsfm.imagesets.parts import map_parts
 from factorsfm.imagesets.photo_folder import Photo, PhotoFolder
+from factorsfm.imagesets.photo_results import by_reason
 from factorsfm.polish.polish import Polished, polish
 from factorsfm.polish.shot import Shot
 from factorsfm.priors.image_depth import ImageDepth
@@ -481,7 +482,7 @@ def test_format_and_focal_length_tell_cameras_apart() -> None:
 
 def test_what_is_said_of_many_photographs_is_said_once() -> None:
     said = [("a", "blank"), *((f"p{k}", "reduced") for k in range(7)), ("b", ""), ("c", "blank")]
-    assert _by_reason(said) == ["a, c: blank.", "p0, p1, p2, p3, p4, … (7 in all): reduced."]
+    assert by_reason(said) == ["a, c: blank.", "p0, p1, p2, p3, p4, … (7 in all): reduced."]
 
 
 def test_a_duplicate_that_lies_on_its_side(shot: RenderedShot, tmp_path: Path) -> None:
