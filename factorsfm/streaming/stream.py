@@ -351,8 +351,7 @@ class Stream(Closing):
         begin = self._horizon.begin
         return EndedShot(
             frames=self.frames[begin:], images=recent(self._mapper.images, begin), mapper=self._mapper,
-            colors=self._colors.table, camera=self._camera.known, lens_given=self._camera.given,
-            depth=self._depth.prior, without_depth=self._depth.failed, control=self.control, imu=self._imu,
+            colors=self._colors.table, camera=self._camera, depth=self._depth, control=self.control, imu=self._imu,
             footage=self._footage.recorded.of(range(begin, len(self.frames))), options=self.options,
             seconds=self.seconds, suspects=suspects, tracks=tracks,
         )  # fmt: skip
