@@ -50,7 +50,6 @@ def triangulate(
     affine: Array | None = None,
     prior: PriorObservations | None = None,
     in_graph: bool = False,
-    seed: int = 0,
 ) -> Triangulation:
     """DLT in RANSAC, then ``min over P of sum E_PR + lambda E_DC`` with cameras and affines fixed (paper, 3.3).
 
@@ -70,7 +69,7 @@ def triangulate(
     angle = np.maximum.reduceat(np.linalg.norm(np.cross(rays, first[o.point]), axis=1), start)
     center = -np.einsum("nji,nj->ni", cameras.rotation[view], cameras.translation[view])
     guess = _homogeneous(first + fallback[:, None] * center, fallback)
-    found = _best_supported(cameras, o, xy, guess, inlier_px, seed)
+    found = _best_supported(cameras, o, xy, guess, inlier_px)
     distance = np.linalg.norm(found[:, :3], axis=1)
     state = replace(cameras, bearing=found[:, :3] / distance[:, None], inverse_distance=found[:, 3] / distance)
     if affine is not None:
@@ -85,7 +84,7 @@ def triangulate(
     return Triangulation(state.bearing, state.inverse_distance, inliers, angle)
 
 
-def _best_supported(cameras: State, o: Observations, xy: Array, guess: Array, inlier_px: float, seed: int) -> Array:
+def _best_supported(cameras: State, o: Observations, xy: Array, guess: Array, inlier_px: float) -> Array:
     """(n, 4) of the guess and of a few two-view points of each track, the one that all of its views fit best.
 
     Args:
@@ -93,7 +92,7 @@ def _best_supported(cameras: State, o: Observations, xy: Array, guess: Array, in
     """
     start, count = o.first, np.diff(np.append(o.first, len(o.point)))
     hypotheses = [guess]
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     for trial in range(_TRIALS):
         a = start if trial == 0 else start + rng.integers(0, count)
         b = start + count - 1 if trial == 0 else start + rng.integers(0, count)

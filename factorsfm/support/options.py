@@ -212,8 +212,9 @@ class Options:
         )
 
 
-def _variant(name: str, mapper: MapperOptions, *, polish_depth: bool = False) -> Options:
-    return replace(Options(), preset=name, mapper=mapper, polish=replace(PolishOptions(), depth=polish_depth))
+def _variant(name: str, mapper: MapperOptions) -> Options:
+    """A preset without the prior in the polish."""
+    return replace(Options(), preset=name, mapper=mapper, polish=replace(PolishOptions(), depth=False))
 
 
 _PAPER = MapperOptions(
