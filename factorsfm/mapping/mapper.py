@@ -23,6 +23,7 @@ from factorsfm.mapping.landmarks import map_tracks
 from factorsfm.mapping.live_covariance import live_covariance
 from factorsfm.mapping.map_contents import MapContents
 from factorsfm.mapping.map_copy import MapCopy
+from factorsfm.mapping.map_news import MapNews
 from factorsfm.mapping.map_registration import register_by_corners
 from factorsfm.mapping.mapped_images import MappedImage, nearest_registered
 from factorsfm.mapping.point_map import PointMap
@@ -43,7 +44,7 @@ Index = NDArray[np.int64]
 
 logger = logging.getLogger(__name__)
 
-_STATE = ("focal", "first_focal", "keyframes", "new_points", "parallax", "started", "unit", "at_odds")
+_STATE = ("focal", "first_focal", "keyframes", "parallax", "started", "unit", "at_odds")
 _RUNNING_OUT = 0.45  # share of an image's tracks with a point, below which the map is extended at once
 
 
@@ -61,13 +62,10 @@ class Mapper(IncrementalMapper):
         super().__init__([], focal, options)
         self.width, self.started, self.frame_rate = width, False, USUAL_RATE
         self.keyframes: list[int] = []
-        self.burn_ins = np.zeros(0, np.int64)  # tracks that the last image showed to be laid over the image
-        self.new_points = 0  # that came with the last image
         self.parallax, self.at_odds = 0.0, 0.0  # largest so far; see `share_at_odds`
-        self.note = ""  # what became of the map with the last image, where that is out of the ordinary
+        self.news = MapNews()  # since the image before
         self.unit = 1.0  # how many times as long lengths are as when the map began
         self.additions = Additions()
-        self.starts_anew = self.begins_again = False  # with the last image: given up; gone on without what bent it
         self._updates = GraphUpdates(graph)
         self._advanced = -1  # number of images for which `advance` was called last
         self._starter = Starter(self.options, has_prior=has_prior)
@@ -145,7 +143,7 @@ class Mapper(IncrementalMapper):
                 image.message = start.reason
             return
         self.started = True
-        self.new_points = len(start.ids)
+        self.news.points = len(start.ids)
         waiting = self._waiting()
         for image in self._accept_start(start):
             self._add_keyframe(image, None)
@@ -174,7 +172,7 @@ class Mapper(IncrementalMapper):
         if self.additions.taken or self.additions.offered:
             reason += "; the factors added are given up with it"
         self.additions, self.unit = Additions(), 1.0
-        self.starts_anew, self.note = True, reason
+        self.news.starts_anew, self.news.note = True, reason
         logger.warning(reason)
 
     # --- registration ---------------------------------------------------------------------------------------------
@@ -241,8 +239,7 @@ class Mapper(IncrementalMapper):
         if self._advanced == len(self.images):
             return
         self._advanced = len(self.images)
-        self.burn_ins, self.new_points = np.zeros(0, np.int64), 0
-        self.note, self.starts_anew, self.begins_again = "", False, False
+        self.news = MapNews()
         if self._updates.is_due(len(self.images)):
             self._take_over()
 
@@ -267,16 +264,16 @@ class Mapper(IncrementalMapper):
             return
         self.keyframes.append(update.position)
         at_odds = self.at_odds if update.at_odds is None else update.at_odds
-        said = self.note, self.additions.follow(update) or update.note, became_much(self.at_odds, at_odds)
+        said = self.news.note, self.additions.follow(update) or update.note, became_much(self.at_odds, at_odds)
         self.at_odds = at_odds
-        self.note = "; ".join(filter(None, said))
-        self.begins_again |= update.begins_again
+        self.news.note = "; ".join(filter(None, said))
+        self.news.begins_again |= update.begins_again
         if update.unit != 1.0:
             self._rescale(update.unit)
         before = image.pose
-        self.new_points += int((~self.points.contains(update.ids)).sum())
+        self.news.points += int((~self.points.contains(update.ids)).sum())
         self._accept_update(update)
-        self.burn_ins = np.union1d(self.burn_ins, update.burn_ins)
+        self.news.burn_ins = np.union1d(self.news.burn_ins, update.burn_ins)
         carry(image, before, self.images[update.position + 1 :])
         if update.focal is not None:
             self._set_focal(update.focal)
@@ -298,14 +295,14 @@ class Mapper(IncrementalMapper):
     def _go_on_without_prior(self) -> None:
         """Leave the prior out from now on. A young map has the shape that the prior gave it, and is given up."""
         self._starter.kind = "essential"
-        self.note = f"going on without the depth prior: {self._prior.lost}"
+        note = self.news.note = f"going on without the depth prior: {self._prior.lost}"
         if len(self.keyframes) > YOUNG_KEYFRAMES:
-            logger.warning(self.note)
+            logger.warning(note)
             return
         for image in self.images:
             if image.registered or image.status in NOT_JOINED:
                 image.forget(FrameStatus.WAITING, "waiting for a start without the depth prior")
-        self._give_up_map(f"{self.note}; starting anew")
+        self._give_up_map(f"{note}; starting anew")
 
     # --- the last image -------------------------------------------------------------------------------------------
 

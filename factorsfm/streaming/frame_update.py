@@ -101,11 +101,12 @@ def frame_update(
     frame: Frame, image: MappedImage, mapper: Mapper, frames: Sequence[SeenFrame], *, focal_changed: bool
 ) -> FrameUpdate:
     """What is known of the newest frame; `image` is that of the mapper, `frames` are all that came."""
+    news = mapper.news
     return FrameUpdate(
         frame.index, image.status, image.message, pose_of(image), image.keyframe, len(image.tracks.ids),
-        image.inliers, mapper.new_points, mapper.parallax, image.covariance, _newest_prior(mapper, frames),
+        image.inliers, news.points, mapper.parallax, image.covariance, _newest_prior(mapper, frames),
         mapper.at_odds, frame.dropped, focal_length=mapper.focal, focal_changed=focal_changed,
-        starts_anew=mapper.starts_anew or mapper.begins_again, note=mapper.note,
+        starts_anew=news.starts_anew or news.begins_again, note=news.note,
     )  # fmt: skip
 
 

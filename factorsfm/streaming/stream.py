@@ -150,9 +150,9 @@ class Stream(Closing):
         focal_changed |= self._camera.follow(mapper)
         self.frames.append(SeenFrame(frame.index, frame.name, frame.timestamp, tracked.texture))
         self._thumbnails.add(frame.image)
-        if len(mapper.burn_ins):
-            self._tracker.avoid(mapper.burn_ins)
-            mapper.forget_tracks(mapper.burn_ins)
+        if len(burn_ins := mapper.news.burn_ins):
+            self._tracker.avoid(burn_ins)
+            mapper.forget_tracks(burn_ins)
         with self.seconds.of("relocalization"):
             self._finder.keep_in_sight(mapper, image, grey)
         self._horizon.follow(mapper, self._finder.relocalizer)
