@@ -11,7 +11,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.control.known import Control, find_frames
+from factorsfm.control.known import Control
+from factorsfm.control.located import find_frames
 from factorsfm.frames.fields import Fields
 from factorsfm.frames.folders import list_images
 from factorsfm.frames.frame import Frame

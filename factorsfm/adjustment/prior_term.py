@@ -18,7 +18,7 @@ from factorsfm.adjustment.prior_weight import (
     measure_weight,
     sample_points,
 )
-from factorsfm.adjustment.problem import POSES, ErrorModel, Free
+from factorsfm.adjustment.problem import ErrorModel
 from factorsfm.adjustment.state import State
 from factorsfm.priors.affine import KNOWN_SHIFT_SIGMA, SCALE_SIGMA, SHIFT_SIGMA, fit_affine
 from factorsfm.support.options import PolishOptions
@@ -105,9 +105,8 @@ def joint_problem(
     weighed: WeighedPrior,
     errors: ErrorModel,
     options: PolishOptions,
-    free: Free = POSES,
 ) -> tuple[BundleAdjustment, PriorPart]:
-    """Tracks and the prior at its weight; `errors`, `options` and `free` as in `BundleAdjustment`."""
+    """Tracks and the prior at its weight; `errors` and `options` as in `BundleAdjustment`."""
     values = prior_values(images, observations, tracks, weighed.rows)
     assert values is not None
     first_scale, first_shift = (
@@ -123,7 +122,7 @@ def joint_problem(
         SHIFT_SIGMA if values.free_shift else KNOWN_SHIFT_SIGMA,
     )  # fmt: skip
     state = replace(state, scale=first_scale, shift=first_shift, field=np.zeros(len(information)))
-    joint = BundleAdjustment(state, observations, options, errors, prior=prior, free=free)
+    joint = BundleAdjustment(state, observations, options, errors, prior=prior)
     none = np.zeros(0)
     return joint, PriorPart(weighed.weight, values.rows, prior, none, none, none, none)
 

@@ -55,10 +55,9 @@ def direction_angles(bearing: Array) -> Array:
     return np.stack([np.arctan2(bearing[:, 0], bearing[:, 2]), np.arcsin(np.clip(bearing[:, 1], -1.0, 1.0))], -1)
 
 
-def sample_points(count: int, seed: int = 0) -> Index:
+def sample_points(count: int) -> Index:
     """Rows of the points on which a weight is measured."""
-    rng = np.random.default_rng(seed)
-    return np.sort(rng.permutation(count)[:_SAMPLE])
+    return np.sort(np.random.default_rng(0).permutation(count)[:_SAMPLE])
 
 
 def measure_weight(angles: Array, inverse_depth: Array, prior: Array, covariance: Array) -> PriorWeight:

@@ -18,7 +18,7 @@ from factorsfm.adjustment.problem import Free, Known
 from factorsfm.adjustment.shared_errors import in_scene_unit_with, shared_errors
 from factorsfm.adjustment.state import State
 from factorsfm.control.fit import ControlFit, ControlResidual
-from factorsfm.control.known import LocatedControl
+from factorsfm.control.located import LocatedControl
 from factorsfm.control.residuals import AlignedState, ControlTerm, Item
 from factorsfm.control.solved_control import SolvedControl
 from factorsfm.control.start import KERNEL, check_size, start_under_control, wide_kernel

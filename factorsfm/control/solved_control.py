@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.state import State
-from factorsfm.control.known import KnownDistance, KnownHeight, KnownPose, LocatedControl
+from factorsfm.control.known import KnownDistance, KnownHeight, KnownPose
+from factorsfm.control.located import LocatedControl
 from factorsfm.control.residuals import (
     DistanceItem,
     HeightItem,

@@ -122,26 +122,31 @@ class _Process:
             GraphProcessKilledError: the process was killed meanwhile, or did not answer as it should.
             FactorsfmError: it ended by itself.
         """
-        requests, answers = _pipes(self._popen)
         data = pickle.dumps(request, pickle.HIGHEST_PROTOCOL)
         begin = time.monotonic()
-        limit = threading.Timer(_SECONDS_TO_ANSWER, self._popen.kill)
-        limit.start()
         try:
-            requests.write(data)
-            requests.flush()
-            answer = pickle.load(answers)
+            answer = self._answer(data)
         except Exception as error:  # whatever a torn pickle may raise
             if time.monotonic() - begin > _SECONDS_TO_ANSWER:
                 reason = f"killed because it gave no answer within {_SECONDS_TO_ANSWER:g} s"
                 raise GraphProcessKilledError(f"the process of the graph was {reason}") from error
             raise self._failure(error) from error
-        finally:
-            limit.cancel()
-            limit.join()
         if not isinstance(answer, Answer):
             raise GraphProcessKilledError(_not_understood(f"it is of type {type(answer).__name__}"))
         return answer
+
+    def _answer(self, data: bytes) -> object:
+        """To a request; a process that gives none in time is killed, and none any more when this returns."""
+        requests, answers = _pipes(self._popen)
+        limit = threading.Timer(_SECONDS_TO_ANSWER, self._popen.kill)
+        limit.start()
+        try:
+            requests.write(data)
+            requests.flush()
+            return pickle.load(answers)
+        finally:
+            limit.cancel()
+            limit.join()
 
     def _failure(self, error: Exception) -> FactorsfmError:
         """What has become of a process whose answer cannot be read."""

@@ -18,7 +18,7 @@ from factorsfm.frames.reading import read_frames
 from factorsfm.frames.unordered import read_images
 from factorsfm.imagesets.joint_adjustment import extended, local_pose
 from factorsfm.imagesets.joint_problem import MatchedImage
-from factorsfm.imagesets.mapper import SetMapper, for_image_sets
+from factorsfm.imagesets.mapper import SetMapper
 from factorsfm.imagesets.photo_folder import pixel_digest, work_folder, write_once
 from factorsfm.result.image_sources import AddedImages, ImageSource, added_images, fields_of, image_sources
 from factorsfm.result.reading import read_result
@@ -203,7 +203,7 @@ class _Extension:
         tracks = self._match(views)
         report("mapping", 0, None)
         first = len(self._known)
-        mapper = SetMapper(tracks, self._base.camera.mean_focal_length(), for_image_sets(Options()))
+        mapper = SetMapper(tracks, self._base.camera.mean_focal_length(), Options().for_image_sets())
         known = [view.frame.cam_from_world for view in self._known]
         mapper.extend({k: local_pose(pose, self._local) for k, pose in enumerate(known) if pose is not None})
         for view, image in zip(self._new, mapper.images[first:], strict=True):

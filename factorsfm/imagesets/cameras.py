@@ -1,16 +1,21 @@
-"""The cameras of an image set: which images share one, and what is known of each."""
+"""The cameras of an image set: which images share one, what is known of each, and its lens in the result."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pycolmap
 
 from factorsfm.camera.guess import guess_camera
+from factorsfm.camera.projection import with_focal
 from factorsfm.imagesets.photo_folder import Photo, PhotoFolder, size_text
+from factorsfm.lens.camera_model import with_distortion
+from factorsfm.lens.lens import Lens
+from factorsfm.result.reconstruction import Reconstruction
 from factorsfm.support.errors import InputError
 
 _SAME_ASPECT = 0.01
@@ -60,6 +65,51 @@ def describe_cameras(cameras: Sequence[pycolmap.Camera], photos: Sequence[Photo]
         size = size_text((camera.width, camera.height))
         said.append(f"{count} of {size} pixels with a focal length of {camera.mean_focal_length():.0f} ({origin})")
     return f"The images come from {len(cameras)} cameras: {'; '.join(said)}."
+
+
+def add_lenses(
+    result: Reconstruction,
+    photos: Sequence[Photo],
+    cameras: Sequence[pycolmap.Camera],
+    first: pycolmap.Camera,
+    found: Lens | None,
+) -> None:
+    """Give a result the lenses of its images at full size, and errors in their pixels instead of those of the map.
+
+    Args:
+        photos: in the order of the result's frames; cameras: as they were known first, at full size.
+        first: the first one, with which the map was made; found: what was found of it, None where it was given.
+    """
+    ratio = result.camera.mean_focal_length() / first.mean_focal_length()
+    shape = found.shape if found is not None and found.bends else None
+    lenses = []
+    for k, camera in enumerate(cameras):
+        focal = ratio * camera.mean_focal_length()
+        own = with_focal(camera, focal) if shape is None else with_distortion(camera, focal, shape)
+        lenses.append(resized(result.camera, (camera.width, camera.height)) if k == 0 else own)
+    shared = Counter(p.camera for p, f in zip(photos, result.frames, strict=True) if f.registered)
+    most = shared.most_common(1)[0][0]
+    factor = np.array([lenses[photo.camera].mean_focal_length() for photo in photos])
+    factor /= result.camera.mean_focal_length()
+    result.camera = lenses[most]
+    by_observation = factor[result.observation_frame]
+    result.observation_error = result.observation_error * by_observation
+    if result.noise is not None:
+        result.noise = replace(result.noise, pixel=result.noise.pixel * by_observation)
+    for frame, photo, own_factor in zip(result.frames, photos, factor.tolist(), strict=True):
+        if photo.camera != most:
+            frame.camera = lenses[photo.camera]
+        frame.reprojection_error *= own_factor
+        if frame.observability is not None:
+            slide = frame.observability.pixel_slide * own_factor
+            frame.observability = replace(frame.observability, pixel_slide=slide)
+
+
+def resized(camera: pycolmap.Camera, size: tuple[int, int]) -> pycolmap.Camera:
+    """A copy for images of another size."""
+    other = pycolmap.Camera(camera.todict())
+    other.rescale(*size)
+    return other
 
 
 def _formats(photos: Sequence[Photo], files: PhotoFolder, given: pycolmap.Camera | None) -> list[list[Photo]]:

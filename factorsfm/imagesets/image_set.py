@@ -1,10 +1,9 @@
-"""Unordered photographs in, a reconstruction out: the counterpart of `stream` for image sets."""
+"""Unordered photographs in, a reconstruction out: the counterpart of `Stream` for image sets."""
 
 from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,23 +12,25 @@ import pycolmap
 from numpy.typing import NDArray
 
 from factorsfm.camera.guess import first_focal_std, guess_camera
-from factorsfm.camera.projection import PIXEL_CENTER, with_focal
-from factorsfm.control.known import Control, LocatedControl, locate
+from factorsfm.camera.projection import PIXEL_CENTER
+from factorsfm.control.known import Control
+from factorsfm.control.located import LocatedControl, locate
 from factorsfm.frames.frame import Frame, bgr_image
-from factorsfm.imagesets.cameras import describe_cameras, find_cameras
-from factorsfm.imagesets.mapper import SetMapper, for_image_sets, map_parts
+from factorsfm.imagesets.cameras import add_lenses, describe_cameras, find_cameras, resized
+from factorsfm.imagesets.mapper import SetMapper
+from factorsfm.imagesets.parts import map_parts
 from factorsfm.imagesets.photo_folder import Photo, PhotoFolder
-from factorsfm.lens.camera_model import distortion_of, with_distortion
-from factorsfm.lens.lens import LensEstimate
+from factorsfm.imagesets.photo_results import add_twins, explain_missing, photo_notes
+from factorsfm.lens.camera_model import distortion_of
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.polish.polish import polish
+from factorsfm.polish.shot import Shot
 from factorsfm.priors.depth import DepthPrior
 from factorsfm.priors.masks import MaskPrior
 from factorsfm.priors.read_priors import read_depth, read_mask
 from factorsfm.result.assembly import assemble
 from factorsfm.result.reconstruction import FrameResult, Reconstruction
 from factorsfm.support.errors import InputError, ReconstructionError
-from factorsfm.support.first_few import first_few
 from factorsfm.support.options import Options
 from factorsfm.support.progress import Progress
 from factorsfm.support.stages import StageSeconds
@@ -45,7 +46,6 @@ Array = NDArray[np.float64]
 logger = logging.getLogger(__name__)
 
 _LEAST_KEYPOINTS = 30
-_NAMED = 5  # photographs in a note, at most
 _WIDE_PARALLAX = 0.3  # of a map that determines the principal point of an unknown lens
 
 
@@ -54,7 +54,7 @@ class ImageSet:
 
     Images of another size but the same aspect ratio count as scaled, upright ones in a set of landscape format (or the
     reverse) are turned; images with another aspect ratio, or with another focal length in their EXIF data, come from a
-    camera of their own (`set_cameras`).
+    camera of their own (`imagesets.cameras`).
 
     Args:
         folder: working copies, features and matches lie here; a second run with the same images goes on from them.
@@ -89,7 +89,7 @@ class ImageSet:
         self._lens_is_open = camera is None and options.lens == "auto"
         if camera is None:
             options = options.for_unknown_lens()
-        self.options = for_image_sets(options)
+        self.options = options.for_image_sets()
         self.photos: list[Photo] = []
         self.seconds = StageSeconds()
         self.notes: list[str] = []
@@ -148,7 +148,7 @@ class ImageSet:
         focal = 0.5 * (camera.focal_length_x + camera.focal_length_y)
         with self.seconds.of("mapping"), OneThreadEach():
             parts = map_parts(tracks, focal, self.options)
-        self._explain(parts)
+        explain_missing(parts, self.photos)
         if parts[0].registered < 2:
             images = parts[0].images
             worst = next(k for k in used if not images[k].registered)
@@ -160,7 +160,7 @@ class ImageSet:
         result = self._solve(parts[0], camera, colors, report, control)
         result.others = [self._solve(part, camera, colors, report, None) for part in parts[1:]]
         for number, part in enumerate((result, *result.others), 1):
-            part.notes += self._summary(part, number, parts)
+            part.notes += self.notes + photo_notes(part, self.photos, number, parts)
             part.seconds = dict(self.seconds)
         return result
 
@@ -178,7 +178,7 @@ class ImageSet:
             if photo.twin is not None:
                 photo.camera = self.photos[photo.twin].camera
         sizes = Counter(photo.size for photo in photos if photo.camera == 0)
-        return _resized(self._cameras[0], sizes.most_common(1)[0][0])
+        return resized(self._cameras[0], sizes.most_common(1)[0][0])
 
     def _located_control(self) -> LocatedControl | None:
         """The control, its marks in pixels of the cameras at full size."""
@@ -197,7 +197,7 @@ class ImageSet:
 
     def _match(self, used: list[int]) -> list[ImageTracks]:
         """Tracks of all images, in pixels of their cameras at full size."""
-        cameras = [_resized(self._cameras[self.photos[k].camera], self.photos[k].size) for k in used]
+        cameras = [resized(self._cameras[self.photos[k].camera], self.photos[k].size) for k in used]
         names = [self.photos[k].file for k in used]
         with self.seconds.of("matching"):
             matches = match_images(
@@ -246,18 +246,16 @@ class ImageSet:
         options = self.options
         if self._lens_is_open and part.parallax > _WIDE_PARALLAX:
             options = replace(options, lens="all")
+        shot = Shot.of(
+            part.images,
+            part.points.all(),
+            np.array([part.focal]),
+            shape=distortion_of(camera) if options.estimates_lens else None,
+            first_focal=(np.array([part.first_focal]), first_focal_std(camera, given=self._lens_given)),
+        )
         with self.seconds.of("polish"), OneThreadEach():
             try:
-                polished = polish(
-                    part.images,
-                    part.points.all(),
-                    np.array([part.focal]),
-                    options,
-                    lambda stage: progress(stage, 0, None),
-                    distortion_of(camera) if options.estimates_lens else None,
-                    control=control,
-                    first_focal=(np.array([part.first_focal]), first_focal_std(camera, given=self._lens_given)),
-                )
+                polished = polish(shot, options, lambda stage: progress(stage, 0, None), control=control)
             except ReconstructionError as error:
                 raise self._failure(str(error), part.images) from error
         result = assemble(
@@ -271,89 +269,10 @@ class ImageSet:
             seconds={},
             options=options.to_dict(),
         )
-        self._add_lenses(result, camera, polished.lens)
-        self._add_twins(result)
+        found = polished.lens.lens if polished.lens is not None and self.camera is None else None
+        add_lenses(result, self.photos, self._cameras, camera, found)
+        add_twins(result, self.photos)
         return result
-
-    # --- the report ---------------------------------------------------------------------------------------------
-
-    def _explain(self, parts: list[SetMapper]) -> None:
-        """Say of every image that is not in a part why, and where it is instead."""
-        home = {i.tracks.position: p for p, part in enumerate(parts) for i in part.images if i.registered}
-        for p, part in enumerate(parts):
-            for k, (photo, image) in enumerate(zip(self.photos, part.images, strict=True)):
-                if photo.left_out:
-                    part.explain(k, FrameStatus.UNUSABLE, photo.left_out)
-                elif k in home and home[k] != p:
-                    reason = "" if image.status is FrameStatus.REGISTERED else f"{image.message}; "
-                    place = f"it is in part {home[k] + 1}, of {parts[home[k]].registered} images"
-                    part.explain(k, FrameStatus.LOST, reason + place)
-                elif photo.remark:
-                    blank = "keypoints" in photo.remark
-                    status = FrameStatus.BLANK if blank else image.status
-                    part.explain(k, status, photo.remark if blank else f"{image.message}; {photo.remark}")
-
-    def _add_twins(self, result: Reconstruction) -> None:
-        """An image with the pixels of another one has its pose."""
-        for photo, frame in zip(self.photos, result.frames, strict=True):
-            if photo.twin is not None and not photo.left_out:
-                twin = result.frames[photo.twin]
-                frame.status, frame.cam_from_world = twin.status, twin.cam_from_world
-                frame.covariance, frame.observability = twin.covariance, twin.observability
-                fate = "whose pose it has" if twin.registered else twin.message
-                frame.message = f"the same image as {twin.name}, {fate}"
-            elif photo.remark and frame.registered:
-                frame.message += f"; {photo.remark}"
-
-    def _add_lenses(self, result: Reconstruction, first: pycolmap.Camera, lens: LensEstimate | None) -> None:
-        """The lenses of the images at full size, and errors in their pixels instead of those of the map."""
-        ratio = result.camera.mean_focal_length() / first.mean_focal_length()
-        shape = lens.lens.shape if lens is not None and self.camera is None and lens.lens.bends else None
-        lenses = []
-        for k, camera in enumerate(self._cameras):
-            focal = ratio * camera.mean_focal_length()
-            own = with_focal(camera, focal) if shape is None else with_distortion(camera, focal, shape)
-            lenses.append(_resized(result.camera, (camera.width, camera.height)) if k == 0 else own)
-        shared = Counter(p.camera for p, f in zip(self.photos, result.frames, strict=True) if f.registered)
-        most = shared.most_common(1)[0][0]
-        factor = np.array([lenses[photo.camera].mean_focal_length() for photo in self.photos])
-        factor /= result.camera.mean_focal_length()
-        result.camera = lenses[most]
-        by_observation = factor[result.observation_frame]
-        result.observation_error = result.observation_error * by_observation
-        if result.noise is not None:
-            result.noise = replace(result.noise, pixel=result.noise.pixel * by_observation)
-        for frame, photo, own_factor in zip(result.frames, self.photos, factor.tolist(), strict=True):
-            if photo.camera != most:
-                frame.camera = lenses[photo.camera]
-            frame.reprojection_error *= own_factor
-            if frame.observability is not None:
-                slide = frame.observability.pixel_slide * own_factor
-                frame.observability = replace(frame.observability, pixel_slide=slide)
-
-    def _summary(self, result: Reconstruction, number: int, parts: list[SetMapper]) -> list[str]:
-        notes = _by_reason((photo.name, photo.left_out) for photo in self.photos)
-        notes += _by_reason((photo.name, photo.remark) for photo in self.photos)
-        if len(parts) > 1:
-            sizes = ", ".join(str(part.registered) for part in parts)
-            notes.append(
-                f"The images fall into {len(parts)} parts that could not be joined, of {sizes} images; this is "
-                f"part {number}, and each has a scale and a world of its own."
-            )
-        found = {i.tracks.position for part in parts for i in part.images if i.registered}
-        missing = [
-            frame
-            for k, (frame, photo) in enumerate(zip(result.frames, self.photos, strict=True))
-            if not photo.left_out and k not in found and photo.twin not in found
-        ]
-        if missing:
-            some = "; ".join(f"{frame.name}: {frame.message}" for frame in missing[:3])
-            notes.append(f"{len(missing)} of {len(result.frames)} images could not be registered ({some}).")
-        twins = [photo for photo in self.photos if photo.twin is not None and not photo.left_out]
-        if twins:
-            some = _some([f"{photo.name} (as {self.photos[photo.twin or 0].name})" for photo in twins])
-            notes.append(f"Images that repeat another one have its pose: {some}.")
-        return self.notes + notes
 
     def _failure(self, message: str, images: list[MappedImage]) -> ReconstructionError:
         frames = []
@@ -363,23 +282,3 @@ class ImageSet:
                 status, reason = images[k].status, images[k].message
             frames.append(FrameResult(photo.index, photo.name, photo.timestamp, status, reason))
         return ReconstructionError(message, frames)
-
-
-def _by_reason(said: Iterable[tuple[str, str]]) -> list[str]:
-    """One note for each reason, of names and reasons; an empty reason is none."""
-    names: dict[str, list[str]] = {}
-    for name, reason in said:
-        if reason:
-            names.setdefault(reason, []).append(name)
-    return [f"{_some(those)}: {reason}." for reason, those in names.items()]
-
-
-def _some(names: list[str]) -> str:
-    return first_few(names, _NAMED) + (f" ({len(names)} in all)" if len(names) > _NAMED else "")
-
-
-def _resized(camera: pycolmap.Camera, size: tuple[int, int]) -> pycolmap.Camera:
-    """A copy for images of another size."""
-    other = pycolmap.Camera(camera.todict())
-    other.rescale(*size)
-    return other

@@ -22,8 +22,9 @@ from factorsfm.graph.keyframe_graph import KeyframeGraph
 from factorsfm.imagesets.covisibility import common_tracks, longest_tracks, pyramid_score, track_lengths
 from factorsfm.imagesets.set_update import update_set
 from factorsfm.imagesets.start import median_angle, possible_starts
-from factorsfm.mapping.depth_fallback import DepthGuidance
-from factorsfm.mapping.incremental import IncrementalMapper, add_points, triangulate_tracks
+from factorsfm.mapping.depth_guidance import DepthGuidance
+from factorsfm.mapping.incremental import IncrementalMapper
+from factorsfm.mapping.landmarks import triangulate_tracks
 from factorsfm.mapping.map_copy import MapCopy
 from factorsfm.mapping.mapped_images import MappedImage, state_of
 from factorsfm.mapping.point_map import PointMap
@@ -41,7 +42,6 @@ Index = NDArray[np.int64]
 
 logger = logging.getLogger(__name__)
 
-_SMALLEST_PART = 3  # images, besides those of the first part
 _LEAST_ANGLE_DEG = 1.5  # between the rays of a new point; less where those of the whole map are small
 _LEAST_ANGLE_SHARE = 0.3  # of the median angle of the map
 _WORKING_TRACKS = (150, 1000, 60_000)  # per image while the map grows: at least, at most, and in the whole set
@@ -52,57 +52,6 @@ _SETTLED_SIGMAS = 2.0  # largest median error in a map that fits, in standard de
 _SETTLED_FOCAL = 0.01  # last relative change of a focal length that is known well enough
 _GOOD_PX = 4.0  # reprojection error of a good observation
 _FOCAL_IMAGES, _FOCAL_ANGLE_DEG = 4, 3.0  # from which a guessed focal length is refined with the map
-
-
-def for_image_sets(options: Options) -> Options:
-    """Two views make a track, wrong matches are single observations, and keypoints are less exact than tracks.
-
-    Where views are far apart the prior adds nothing to triangulation and graph; the paper's presets triangulate with it
-    all the same.
-    """
-    depth = options.mapper.triangulation_depth
-    return replace(
-        options,
-        mapper=replace(
-            options.mapper,
-            pixel_sigma=0.5,
-            graph_depth=False,
-            triangulation_depth="none" if depth == "inverse" else depth,
-        ),
-        polish=replace(
-            options.polish, min_track_length=2, final_iterations=20, observation_sigmas=12.0, doubtful_px=0.6
-        ),
-    )
-
-
-def map_parts(tracks: list[ImageTracks], focal: float, options: Options) -> list[SetMapper]:
-    """A map of the images that belong together, and others among those that are left over.
-
-    What cannot be joined to a map, for want of common tracks or because no pose agrees with it, gets a map of its own
-    where at least three images make one.
-
-    Returns:
-        The maps by number of images, largest first. An image is registered in one of them at most; where it is not,
-        its message says why it is not in the first map that was made. That one is there even without images.
-    """
-    parts: list[SetMapper] = []
-    nothing = np.zeros(0, np.int64)
-    while True:
-        mapper = SetMapper(tracks, focal, options)
-        mapper.run()
-        tried = [image for image in mapper.images if image.status is not FrameStatus.TOO_FEW_TRACKS]
-        found = [image for image in mapper.images if image.registered]
-        if not parts or len(found) >= _SMALLEST_PART:
-            parts.append(mapper)
-        done = {image.tracks.position for image in (found if len(found) >= _SMALLEST_PART else tried)}
-        if not done:
-            break
-        tracks = [t.of(nothing) if t.position in done else t for t in tracks]
-    for part in parts[1:]:  # there, images were missing
-        for image, first in zip(part.images, parts[0].images, strict=True):
-            if not image.registered:
-                image.status, image.message = first.status, first.message
-    return sorted(parts, key=lambda part: -part.registered)
 
 
 class SetMapper(IncrementalMapper):
@@ -316,7 +265,7 @@ class SetMapper(IncrementalMapper):
         if good.any():
             self._angle = float(np.median(angle[good]))
         good &= angle > min(_LEAST_ANGLE_DEG, _LEAST_ANGLE_SHARE * self._angle)
-        add_points(self.points, ids, found, good)
+        self.points.set(ids[good], found.points(good))
 
     def _guidance(self, images: Sequence[MappedImage]) -> DepthGuidance:
         """The depth prior beside the map, fitted for each of these images where the options ask for it."""

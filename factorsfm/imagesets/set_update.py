@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from factorsfm.graph.keyframe_graph import KeyframeGraph
 from factorsfm.graph.window import Window
-from factorsfm.mapping.depth_fallback import DepthGuidance
+from factorsfm.mapping.depth_guidance import DepthGuidance
 from factorsfm.mapping.graph_window import LEAST_SHARED, choose_landmarks, measured_window, window_rows
 from factorsfm.mapping.landmarks import mapped_landmarks, solve_alone
 from factorsfm.mapping.map_copy import MapCopy, MapUpdate

@@ -1,5 +1,5 @@
 """IMU: recordings and their files, preintegration, the fit of clock and axes to a camera, visual-inertial alignment.
 
-Takes the samples of a gyroscope and an accelerometer and the poses of frames, gives metric scale, gravity and
-rotations, all as plain arrays. May import `camera` and what lies below it.
+Takes the samples of a gyroscope and an accelerometer and the poses of frames, gives metric scale and gravity, as plain
+arrays. May import `camera` and what lies below it.
 """

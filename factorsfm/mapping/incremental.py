@@ -7,16 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.adjustment.gather import gather
-from factorsfm.mapping.depth_fallback import DepthGuidance
 from factorsfm.mapping.live_covariance import doubt
 from factorsfm.mapping.map_copy import MapUpdate
 from factorsfm.mapping.map_registration import NotOnMap, register_on_map
-from factorsfm.mapping.mapped_images import MappedImage, refocus, state_of
+from factorsfm.mapping.mapped_images import MappedImage, refocus
 from factorsfm.mapping.point_map import PointMap
 from factorsfm.mapping.registration import Registration
 from factorsfm.mapping.starts import Start
-from factorsfm.mapping.triangulation import Triangulation, triangulate
 from factorsfm.support.options import Options
 from factorsfm.support.status import FrameStatus
 
@@ -108,37 +105,3 @@ class IncrementalMapper:
         """Go on with another focal length; what was seen stays as it is in pixels."""
         refocus(self.images, focal / self.focal)
         self.focal = focal
-
-
-def triangulate_tracks(
-    images: Sequence[MappedImage],
-    ids: Index,
-    guidance: DepthGuidance,
-    *,
-    focal: float,
-    inlier_px: float,
-    fallback: Array,
-) -> Triangulation:
-    """Points of some tracks (ascending ids) from the images that see them, with the depth prior of the options.
-
-    Args:
-        images: registered; focal, inlier_px: pixels.
-        fallback: (n,) inverse distance along the first ray where the views leave it open.
-    """
-    affine, prior = guidance.at_observations(images, ids)
-    return triangulate(
-        state_of(images, np.zeros((0, 3)), focal),
-        gather([image.tracks for image in images], ids, focal),
-        inlier_px=inlier_px,
-        sigma=guidance.options.pixel_sigma,
-        fallback=fallback,
-        affine=affine,
-        prior=prior,
-        in_graph=guidance.options.triangulation_depth == "paper",
-    )
-
-
-def add_points(points: PointMap, ids: Index, found: Triangulation, good: NDArray[np.bool_]) -> int:
-    """Add those triangulated points that are good to the map; their number."""
-    points.set(ids[good], found.bearing[good] / found.inverse_distance[good, None])
-    return int(good.sum())

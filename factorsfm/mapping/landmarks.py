@@ -12,12 +12,11 @@ from factorsfm.adjustment.bundle_adjustment import BundleAdjustment
 from factorsfm.adjustment.gather import gather
 from factorsfm.adjustment.observations import Observations
 from factorsfm.adjustment.problem import ErrorModel, Free
-from factorsfm.mapping.depth_fallback import DepthGuidance
-from factorsfm.mapping.incremental import add_points, triangulate_tracks
+from factorsfm.mapping.depth_guidance import DepthGuidance
 from factorsfm.mapping.map_copy import MapCopy, MapUpdate
 from factorsfm.mapping.mapped_images import MappedImage, state_of
 from factorsfm.mapping.point_map import PointMap
-from factorsfm.mapping.triangulation import triangulate
+from factorsfm.mapping.triangulation import Triangulation, triangulate
 from factorsfm.motion.suspects import agreeing
 from factorsfm.support.options import MapperOptions, PolishOptions
 from factorsfm.tracks.image_tracks import seen_by
@@ -136,31 +135,32 @@ def errors_on_map(
     return judged, observations, errors, suspected
 
 
-def _add_points(
-    points: PointMap,
+def triangulate_tracks(
     images: Sequence[MappedImage],
-    near: MappedImage,
     ids: Index,
     guidance: DepthGuidance,
+    *,
     focal: float,
-) -> int:
-    """Triangulate tracks of `near` (ascending) from all images, and add what they agree on to the map."""
-    found = triangulate_tracks(
-        images, ids, guidance,
-        focal=focal, inlier_px=guidance.options.inlier_px, fallback=guidance.fallback(near, ids),
-    )  # fmt: skip
-    return add_points(points, ids, found, (found.inliers >= 2) & (found.inverse_distance > _FARTHEST))
+    inlier_px: float,
+    fallback: Array,
+) -> Triangulation:
+    """Points of some tracks (ascending ids) from the images that see them, with the depth prior of the options.
 
-
-def _spread(xy: Array, taken: NDArray[np.bool_], candidates: NDArray[np.intp], count: int) -> NDArray[np.intp]:
-    """`count` of the candidates, taken in turn from the emptiest cells of a grid; older tracks come first."""
-    cell = np.floor((xy - xy.min(0)) / np.maximum(np.ptp(xy, axis=0), 1e-9) * [15.99, 8.99]).astype(int)
-    key = cell[:, 0] * 9 + cell[:, 1]
-    load = np.bincount(key[taken], minlength=144)
-    order = candidates[np.argsort(key[candidates], kind="stable")]
-    first = np.searchsorted(key[order], np.arange(144))
-    rank = np.arange(len(order)) - first[key[order]] + load[key[order]]
-    return np.asarray(order[np.argsort(rank, kind="stable")[:count]])
+    Args:
+        images: registered; focal, inlier_px: pixels.
+        fallback: (n,) inverse distance along the first ray where the views leave it open.
+    """
+    affine, prior = guidance.at_observations(images, ids)
+    return triangulate(
+        state_of(images, np.zeros((0, 3)), focal),
+        gather([image.tracks for image in images], ids, focal),
+        inlier_px=inlier_px,
+        sigma=guidance.options.pixel_sigma,
+        fallback=fallback,
+        affine=affine,
+        prior=prior,
+        in_graph=guidance.options.triangulation_depth == "paper",
+    )
 
 
 def solve_alone(
@@ -196,3 +196,32 @@ def solve_alone(
     every, points = np.concatenate([update.ids, ids[good]]), np.concatenate([update.points, state.points[good]])
     order = np.argsort(every)
     return replace(update, ids=every[order], points=points[order], removed=np.union1d(update.removed, ids[~good]))
+
+
+def _add_points(
+    points: PointMap,
+    images: Sequence[MappedImage],
+    near: MappedImage,
+    ids: Index,
+    guidance: DepthGuidance,
+    focal: float,
+) -> int:
+    """Triangulate tracks of `near` (ascending) from all images, and add what they agree on to the map."""
+    found = triangulate_tracks(
+        images, ids, guidance,
+        focal=focal, inlier_px=guidance.options.inlier_px, fallback=guidance.fallback(near, ids),
+    )  # fmt: skip
+    good = (found.inliers >= 2) & (found.inverse_distance > _FARTHEST)
+    points.set(ids[good], found.points(good))
+    return int(good.sum())
+
+
+def _spread(xy: Array, taken: NDArray[np.bool_], candidates: NDArray[np.intp], count: int) -> NDArray[np.intp]:
+    """`count` of the candidates, taken in turn from the emptiest cells of a grid; older tracks come first."""
+    cell = np.floor((xy - xy.min(0)) / np.maximum(np.ptp(xy, axis=0), 1e-9) * [15.99, 8.99]).astype(int)
+    key = cell[:, 0] * 9 + cell[:, 1]
+    load = np.bincount(key[taken], minlength=144)
+    order = candidates[np.argsort(key[candidates], kind="stable")]
+    first = np.searchsorted(key[order], np.arange(144))
+    rank = np.arange(len(order)) - first[key[order]] + load[key[order]]
+    return np.asarray(order[np.argsort(rank, kind="stable")[:count]])

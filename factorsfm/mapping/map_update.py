@@ -17,7 +17,7 @@ from factorsfm.graph.live_isam import YOUNG
 from factorsfm.graph.unit_of_length import unit_of_length
 from factorsfm.graph.window import Window
 from factorsfm.mapping.at_odds import share_at_odds, share_left_out
-from factorsfm.mapping.depth_fallback import DepthGuidance
+from factorsfm.mapping.depth_guidance import DepthGuidance
 from factorsfm.mapping.graph_window import choose_landmarks, choose_window, measured_window
 from factorsfm.mapping.landmarks import add_landmarks, mapped_landmarks, solve_alone
 from factorsfm.mapping.live_covariance import window_covariance
@@ -94,15 +94,17 @@ def _extended(copy: MapCopy, graph: KeyframeGraph) -> MapUpdate:
     ids, others = choose_landmarks(images, ids[fits], copy.added.tracks)
     others = np.union1d(others, np.setdiff1d(contradicting, laid_over))
     result = _solved(copy, graph, images, constant, ids, iterations)
-    burn_ins, removed, moving = burn_ins_of(result.window, o.pixel_sigma), ids[:0], 0
-    scene = np.setdiff1d(ids, burn_ins) if len(burn_ins) else _scene(copy, graph, images, result.window, mapped)
+    burn_ins = burn_ins_of(result.window, o.pixel_sigma)
+    if len(burn_ins):
+        tried, scene = ids, np.setdiff1d(ids, burn_ins)
+    else:
+        tried, scene = mapped, _scene(copy, graph, images, result.window, mapped)
     bent = not np.array_equal(scene, ids)
-    if bent:
-        tried = ids if len(burn_ins) else mapped
-        moving = 0 if len(burn_ins) else len(mapped) - len(scene)
+    removed, moving = ids[:0], 0
+    if bent:  # once more, with the scene alone
+        moving = len(tried) - len(burn_ins) - len(scene)
         ids = lifted_anew(copy, images, scene)
-        removed = np.setdiff1d(tried, ids)
-        others = np.setdiff1d(others, tried)
+        removed, others = np.setdiff1d(tried, ids), np.setdiff1d(others, tried)
         result = _solved(copy, graph, images, constant, ids, _YOUNG_ITERATIONS)
     if not result.committed:
         return MapUpdate(position, depth, False, result.reason, mirrored=result.mirrored)

@@ -5,25 +5,25 @@ from __future__ import annotations
 import itertools
 import logging
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from factorsfm.graph.contents import LiveGraph, graph_contents
+from factorsfm.graph.contents import LiveGraph
 from factorsfm.graph.process import GraphProcess
 from factorsfm.graph.unit_of_length import unit_of_length
 from factorsfm.mapping.additions import Additions
 from factorsfm.mapping.at_odds import EVERY, became_much
-from factorsfm.mapping.graph_updates import submit_update
+from factorsfm.mapping.graph_updates import GraphUpdates
 from factorsfm.mapping.incremental import IncrementalMapper
 from factorsfm.mapping.keyframes import carry, is_keyframe, suddenly_rough, update_delay
 from factorsfm.mapping.landmarks import map_tracks
 from factorsfm.mapping.live_covariance import live_covariance
 from factorsfm.mapping.map_contents import MapContents
-from factorsfm.mapping.map_copy import MapCopy, MapUpdate
+from factorsfm.mapping.map_copy import MapCopy
+from factorsfm.mapping.map_news import MapNews
 from factorsfm.mapping.map_registration import register_by_corners
 from factorsfm.mapping.mapped_images import MappedImage, nearest_registered
 from factorsfm.mapping.point_map import PointMap
@@ -44,7 +44,7 @@ Index = NDArray[np.int64]
 
 logger = logging.getLogger(__name__)
 
-_STATE = ("focal", "first_focal", "keyframes", "new_points", "parallax", "started", "unit", "at_odds", "_due")
+_STATE = ("focal", "first_focal", "keyframes", "parallax", "started", "unit", "at_odds")
 _RUNNING_OUT = 0.45  # share of an image's tracks with a point, below which the map is extended at once
 
 
@@ -62,52 +62,19 @@ class Mapper(IncrementalMapper):
         super().__init__([], focal, options)
         self.width, self.started, self.frame_rate = width, False, USUAL_RATE
         self.keyframes: list[int] = []
-        self.burn_ins = np.zeros(0, np.int64)  # tracks that the last image showed to be laid over the image
-        self.new_points = 0  # that came with the last image
         self.parallax, self.at_odds = 0.0, 0.0  # largest so far; see `share_at_odds`
-        self.note = ""  # what became of the map with the last image, where that is out of the ordinary
+        self.news = MapNews()  # since the image before
         self.unit = 1.0  # how many times as long lengths are as when the map began
         self.additions = Additions()
-        self.starts_anew = self.begins_again = False  # with the last image: given up; gone on without what bent it
-        self._graph = graph
-        self._update: Future[MapUpdate] | None = None
-        self._due, self._advanced = 0, -1  # number of images for which `advance` was called last
+        self._updates = GraphUpdates(graph)
+        self._advanced = -1  # number of images for which `advance` was called last
         self._starter = Starter(self.options, has_prior=has_prior)
         self._reads_every_depth = has_prior and (
             self._starter.kind == "pair" or self.options.registration_depth != "none"
         )
         self._prior = PriorTrust(has_prior and options.uses_depth)
 
-    # --- snapshots ----------------------------------------------------------------------------------------------
-
-    def state(self) -> dict[str, Any]:
-        """Everything that `restore` needs; waits for what the graph is working on."""
-        update = self._update.result() if self._update is not None else None
-        return {
-            **{name: getattr(self, name) for name in _STATE},
-            "start_kind": self._starter.kind,
-            "prior": [self._prior.lost, self._prior.mirrored, self._prior.missing],
-            "images": list(self.images),
-            "points": self.points.all(),
-            "additions": self.additions.state(),
-            "update": update,
-        }
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Go on where `state` was taken. The graph is rebuilt from the map at its next update."""
-        for name in _STATE:
-            setattr(self, name, state[name])
-        self._starter.kind = state["start_kind"]
-        self._prior = PriorTrust(self._prior.wanted, *state["prior"])
-        self.images = list(state["images"])
-        self.points = PointMap()
-        self.points.set(*state["points"])
-        self.additions.restore(state["additions"])
-        if state["update"] is not None:
-            self._update = Future()
-            self._update.set_result(state["update"])
-
-    # --- the algorithm ------------------------------------------------------------------------------------------
+    # --- the algorithm --------------------------------------------------------------------------------------------
 
     def add(
         self, tracks: ImageTracks, read_depth: Callable[[], ImageDepth | None], *, keyframe: bool = False
@@ -134,16 +101,6 @@ class Mapper(IncrementalMapper):
             raise
         return image
 
-    def advance(self) -> None:
-        """Before the next image: take over what the graph has made of a keyframe, if that is due."""
-        if self._advanced == len(self.images):
-            return
-        self._advanced = len(self.images)
-        self.burn_ins, self.new_points = np.zeros(0, np.int64), 0
-        self.note, self.starts_anew, self.begins_again = "", False, False
-        if self._update is not None and len(self.images) >= self._due:
-            self._take_over()
-
     def _process(self, image: MappedImage, read_depth: Callable[[], ImageDepth | None]) -> None:
         if len(image.tracks.ids) < self.options.min_tracks:
             image.status = FrameStatus.TOO_FEW_TRACKS
@@ -167,73 +124,12 @@ class Mapper(IncrementalMapper):
         self._register(image)
         if not image.registered and map_tracks(image, self.images, self.points, self.options, self.focal):
             self._register(image)
-        if image.registered and self._update is None and self._is_keyframe(image):
+        if image.registered and not self._updates.pending and self._is_keyframe(image):
             self._add_keyframe(image, read_depth)
             if hurry:
                 self._take_over()
 
-    def finish(self, last_factors: Callable[[Mapper], None] = lambda mapper: None) -> None:
-        """No more images: start with what there is, if nothing better came; all images on the map as it is at last.
-
-        Args:
-            last_factors: may add factors to the map as the last keyframe left it.
-        """
-        self._take_over()
-        if not self.started:
-            self._begin(self._starter.last_resort(self._waiting(), self.focal))
-        last_factors(self)
-        if self.additions.offered:  # no update will take them: the polish does
-            self._rescale(unit_of_length(self.additions.everything(), self.contents())[0])
-        self.refresh()
-        self._take_up_lost()
-        self.close()
-
-    def add_factors(self, graph: object, values: object) -> None:
-        """Let the next update of the graph take factors of the caller; errors as in `checked_factors`."""
-        keyframes = [image for image in self.images if image.keyframe]  # and the one that the graph is working on
-        self.additions.offer(graph, values, MapContents(keyframes, self.points))
-
-    def contents(self) -> MapContents:
-        """Poses, affines and landmarks by frame and track."""
-        return MapContents(self.images, self.points)
-
-    def graph(self) -> LiveGraph:
-        """A copy of the keyframe graph as the last update left it, empty before the first one."""
-        return graph_contents(self._graph)
-
-    def close(self) -> None:
-        """Let the graph go; what it is working on is lost."""
-        self._graph.close()
-
-    def refresh(self) -> None:
-        """Register the images between the keyframes once more, on the map as it is now."""
-        self._take_over()
-        for image in self.images:
-            if image.registered and not image.keyframe:
-                known = image.status, image.message
-                self._register(image)
-                if image.status is not FrameStatus.REGISTERED:
-                    image.status, image.message = known
-
-    def _take_up_lost(self) -> None:
-        """Register what the map had lost, or not reached yet, from its ends and gaps on: backwards, then forwards."""
-        if not self.started:
-            return
-        found = True
-        while found:
-            found = False
-            for image in itertools.chain(reversed(self.images), self.images):
-                if image.registered or image.status not in NOT_JOINED:
-                    continue
-                known = image.status, image.message
-                map_tracks(image, self.images, self.points, self.options, self.focal)
-                self._register(image)
-                if image.registered:
-                    found = True
-                else:
-                    image.status, image.message = known
-
-    # --- start --------------------------------------------------------------------------------------------------
+    # --- start ----------------------------------------------------------------------------------------------------
 
     def _waiting(self) -> list[MappedImage]:
         return [image for image in self.images if image.status is FrameStatus.WAITING]
@@ -247,7 +143,7 @@ class Mapper(IncrementalMapper):
                 image.message = start.reason
             return
         self.started = True
-        self.new_points = len(start.ids)
+        self.news.points = len(start.ids)
         waiting = self._waiting()
         for image in self._accept_start(start):
             self._add_keyframe(image, None)
@@ -270,16 +166,16 @@ class Mapper(IncrementalMapper):
         self._give_up_map(left_behind(self.images))
 
     def _give_up_map(self, reason: str) -> None:
-        self._graph.start_anew()
+        self._updates.start_anew()
         self.points, self.keyframes, self.started = PointMap(), [], False
         self.parallax, self.at_odds = 0.0, 0.0
         if self.additions.taken or self.additions.offered:
             reason += "; the factors added are given up with it"
         self.additions, self.unit = Additions(), 1.0
-        self.starts_anew, self.note = True, reason
+        self.news.starts_anew, self.news.note = True, reason
         logger.warning(reason)
 
-    # --- registration -------------------------------------------------------------------------------------------
+    # --- registration ---------------------------------------------------------------------------------------------
 
     def _register(self, image: MappedImage) -> None:
         near = image if image.registered else nearest_registered(self.images, image.tracks.position)
@@ -315,7 +211,7 @@ class Mapper(IncrementalMapper):
         for image in self.images[:-1]:
             image.forget_tracks(ids)
 
-    # --- keyframes and landmarks --------------------------------------------------------------------------------
+    # --- keyframes and landmarks ----------------------------------------------------------------------------------
 
     def _is_keyframe(self, image: MappedImage) -> bool:
         last, count = self.images[self.keyframes[-1]].tracks, len(self.keyframes)
@@ -333,17 +229,25 @@ class Mapper(IncrementalMapper):
         )  # fmt: skip
         if self._prior.lost:
             copy = copy.without_prior()
+        delay = update_delay(len(self.keyframes), self.options, self.frame_rate)
         read = read_depth if self._prior.active else None
-        self._update = submit_update(self._graph, copy, read)
+        self._updates.begin(copy, read, due=len(self.images) - 1 + delay)
         image.keyframe = True
-        self._due = len(self.images) - 1 + update_delay(len(self.keyframes), self.options, self.frame_rate)
+
+    def advance(self) -> None:
+        """Before the next image: take over what the graph has made of a keyframe, if that is due."""
+        if self._advanced == len(self.images):
+            return
+        self._advanced = len(self.images)
+        self.news = MapNews()
+        if self._updates.is_due(len(self.images)):
+            self._take_over()
 
     def _take_over(self) -> None:
         """Wait for the graph, and take over the map as it sees it now."""
-        if self._update is None:
+        update = self._updates.taken()
+        if update is None:
             return
-        pending, self._update = self._update, None
-        update = pending.result()
         image = self.images[update.position]
         if image.tracks.depth is None and update.depth is not None:
             image.tracks = replace(image.tracks, depth=update.depth)
@@ -360,16 +264,16 @@ class Mapper(IncrementalMapper):
             return
         self.keyframes.append(update.position)
         at_odds = self.at_odds if update.at_odds is None else update.at_odds
-        said = self.note, self.additions.follow(update) or update.note, became_much(self.at_odds, at_odds)
+        said = self.news.note, self.additions.follow(update) or update.note, became_much(self.at_odds, at_odds)
         self.at_odds = at_odds
-        self.note = "; ".join(filter(None, said))
-        self.begins_again |= update.begins_again
+        self.news.note = "; ".join(filter(None, said))
+        self.news.begins_again |= update.begins_again
         if update.unit != 1.0:
             self._rescale(update.unit)
         before = image.pose
-        self.new_points += int((~self.points.contains(update.ids)).sum())
+        self.news.points += int((~self.points.contains(update.ids)).sum())
         self._accept_update(update)
-        self.burn_ins = np.union1d(self.burn_ins, update.burn_ins)
+        self.news.burn_ins = np.union1d(self.news.burn_ins, update.burn_ins)
         carry(image, before, self.images[update.position + 1 :])
         if update.focal is not None:
             self._set_focal(update.focal)
@@ -381,6 +285,8 @@ class Mapper(IncrementalMapper):
         for image in self.images:
             image.scale(unit)
 
+    # --- without the prior ----------------------------------------------------------------------------------------
+
     @property
     def without_prior(self) -> str:
         """Why the depth prior takes no part any more, empty while it does."""
@@ -389,11 +295,102 @@ class Mapper(IncrementalMapper):
     def _go_on_without_prior(self) -> None:
         """Leave the prior out from now on. A young map has the shape that the prior gave it, and is given up."""
         self._starter.kind = "essential"
-        self.note = f"going on without the depth prior: {self._prior.lost}"
+        note = self.news.note = f"going on without the depth prior: {self._prior.lost}"
         if len(self.keyframes) > YOUNG_KEYFRAMES:
-            logger.warning(self.note)
+            logger.warning(note)
             return
         for image in self.images:
             if image.registered or image.status in NOT_JOINED:
                 image.forget(FrameStatus.WAITING, "waiting for a start without the depth prior")
-        self._give_up_map(f"{self.note}; starting anew")
+        self._give_up_map(f"{note}; starting anew")
+
+    # --- the last image -------------------------------------------------------------------------------------------
+
+    def finish(self, last_factors: Callable[[Mapper], None] = lambda mapper: None) -> None:
+        """No more images: start with what there is, if nothing better came; all images on the map as it is at last.
+
+        Args:
+            last_factors: may add factors to the map as the last keyframe left it.
+        """
+        self._take_over()
+        if not self.started:
+            self._begin(self._starter.last_resort(self._waiting(), self.focal))
+        last_factors(self)
+        if self.additions.offered:  # no update will take them: the polish does
+            self._rescale(unit_of_length(self.additions.everything(), self.contents())[0])
+        self.refresh()
+        self._take_up_lost()
+        self.close()
+
+    def refresh(self) -> None:
+        """Register the images between the keyframes once more, on the map as it is now."""
+        self._take_over()
+        for image in self.images:
+            if image.registered and not image.keyframe:
+                known = image.status, image.message
+                self._register(image)
+                if image.status is not FrameStatus.REGISTERED:
+                    image.status, image.message = known
+
+    def _take_up_lost(self) -> None:
+        """Register what the map had lost, or not reached yet, from its ends and gaps on: backwards, then forwards."""
+        if not self.started:
+            return
+        found = True
+        while found:
+            found = False
+            for image in itertools.chain(reversed(self.images), self.images):
+                if image.registered or image.status not in NOT_JOINED:
+                    continue
+                known = image.status, image.message
+                map_tracks(image, self.images, self.points, self.options, self.focal)
+                self._register(image)
+                if image.registered:
+                    found = True
+                else:
+                    image.status, image.message = known
+
+    def close(self) -> None:
+        """Let the graph go; what it is working on is lost."""
+        self._updates.close()
+
+    # --- the graph, and factors of the caller ---------------------------------------------------------------------
+
+    def graph(self) -> LiveGraph:
+        """A copy of the keyframe graph as the last update left it, empty before the first one."""
+        return self._updates.contents()
+
+    def contents(self) -> MapContents:
+        """Poses, affines and landmarks by frame and track."""
+        return MapContents(self.images, self.points)
+
+    def add_factors(self, graph: object, values: object) -> None:
+        """Let the next update of the graph take factors of the caller; errors as in `checked_factors`."""
+        keyframes = [image for image in self.images if image.keyframe]  # and the one that the graph is working on
+        self.additions.offer(graph, values, MapContents(keyframes, self.points))
+
+    # --- snapshots ------------------------------------------------------------------------------------------------
+
+    def state(self) -> dict[str, Any]:
+        """Everything that `restore` needs; waits for what the graph is working on."""
+        return {
+            **{name: getattr(self, name) for name in _STATE},
+            "start_kind": self._starter.kind,
+            "prior": [self._prior.lost, self._prior.mirrored, self._prior.missing],
+            "images": list(self.images),
+            "points": self.points.all(),
+            "additions": self.additions.state(),
+            **self._updates.state(),
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go on where `state` was taken. The graph is rebuilt from the map at its next update."""
+        for name in _STATE:
+            setattr(self, name, state[name])
+        self._starter.kind = state["start_kind"]
+        self._prior = PriorTrust(self._prior.wanted, *state["prior"])
+        self.images = list(state["images"])
+        self.points = PointMap()
+        self.points.set(*state["points"])
+        self.additions.restore(state["additions"])
+        self._updates.restore(state)

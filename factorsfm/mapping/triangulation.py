@@ -25,15 +25,19 @@ class Triangulation:
     """Points of tracks.
 
     Attributes:
-        bearing (n, 3) unit and inverse_distance (n,): the points, as in `refinement.State`.
+        bearing (n, 3) unit and inverse_distance (n,): the points, as in `State`.
         inliers: (n,) views that agree with the point.
-        angle: (n,) largest angle between its rays (radians).
+        angle: (n,) sine of the largest angle between its first ray and another, nearly this angle (radians).
     """
 
     bearing: Array
     inverse_distance: Array
     inliers: NDArray[np.int64]
     angle: Array
+
+    def points(self, good: NDArray[np.bool_]) -> Array:
+        """(k, 3) those of the (n,) tracks that are good, at a positive distance."""
+        return self.bearing[good] / self.inverse_distance[good, None]
 
 
 def triangulate(
@@ -46,7 +50,6 @@ def triangulate(
     affine: Array | None = None,
     prior: PriorObservations | None = None,
     in_graph: bool = False,
-    seed: int = 0,
 ) -> Triangulation:
     """DLT in RANSAC, then ``min over P of sum E_PR + lambda E_DC`` with cameras and affines fixed (paper, 3.3).
 
@@ -58,32 +61,17 @@ def triangulate(
         inlier_px, sigma: pixels.
         in_graph: whether GTSAM solves for the points, where there is a prior: the same minimum, in five times the time.
     """
-    o, rotation, translation = observations, cameras.rotation, cameras.translation
-    start = o.first
-    n = len(start)
-    count = np.diff(np.append(start, len(o.point)))
+    o, start = observations, observations.first
     xy = cameras.normalized(o)
-    rays = np.concatenate([xy, np.ones((len(xy), 1))], 1)
-    rays = np.einsum("nji,nj->ni", rotation[o.frame], rays)
+    rays = np.einsum("nji,nj->ni", cameras.rotation[o.frame], np.concatenate([xy, np.ones((len(xy), 1))], 1))
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    first = rays[start]
-    center = -np.einsum("nji,nj->ni", rotation[o.frame[start]], translation[o.frame[start]])
+    first, view = rays[start], o.frame[start]
     angle = np.maximum.reduceat(np.linalg.norm(np.cross(rays, first[o.point]), axis=1), start)
+    center = -np.einsum("nji,nj->ni", cameras.rotation[view], cameras.translation[view])
     guess = _homogeneous(first + fallback[:, None] * center, fallback)
-    hypotheses = [guess]
-    rng = np.random.default_rng(seed)
-    for trial in range(_TRIALS):
-        a = start if trial == 0 else start + rng.integers(0, count)
-        b = start + count - 1 if trial == 0 else start + rng.integers(0, count)
-        hypotheses.append(_two_view(cameras, o.frame, xy, a, b))
-    stacked = np.stack(hypotheses)
-    support = np.stack([_support(cameras, o, xy, h, inlier_px) for h in stacked])
-    inliers = np.stack([np.add.reduceat((s < inlier_px).astype(np.int64), start) for s in support])
-    robust = np.stack([np.add.reduceat(np.minimum(s, inlier_px), start) for s in support])
-    best = np.argmin(robust, axis=0)
-    chosen = stacked[best, np.arange(n)]
-    distance = np.linalg.norm(chosen[:, :3], axis=1)
-    state = replace(cameras, bearing=chosen[:, :3] / distance[:, None], inverse_distance=chosen[:, 3] / distance)
+    found = _best_supported(cameras, o, xy, guess, inlier_px)
+    distance = np.linalg.norm(found[:, :3], axis=1)
+    state = replace(cameras, bearing=found[:, :3] / distance[:, None], inverse_distance=found[:, 3] / distance)
     if affine is not None:
         state = replace(state, scale=affine[:, 0], shift=affine[:, 1], field=np.zeros(1))
     if in_graph and prior is not None:
@@ -91,9 +79,28 @@ def triangulate(
     else:
         options = replace(PolishOptions(), iterations=8)
         state = BundleAdjustment(state, o, options, ErrorModel(sigma), prior=prior, free=Free(cameras=False)).solve()
-    error = _support(cameras, o, xy, _homogeneous(state.bearing, state.inverse_distance), inlier_px)
+    error = _errors(cameras, o, xy, _homogeneous(state.bearing, state.inverse_distance), inlier_px)
     inliers = np.add.reduceat((error < inlier_px).astype(np.int64), start)
     return Triangulation(state.bearing, state.inverse_distance, inliers, angle)
+
+
+def _best_supported(cameras: State, o: Observations, xy: Array, guess: Array, inlier_px: float) -> Array:
+    """(n, 4) of the guess and of a few two-view points of each track, the one that all of its views fit best.
+
+    Args:
+        xy: (m, 2) of the observations, normalised; guess: (n, 4) homogeneous.
+    """
+    start, count = o.first, np.diff(np.append(o.first, len(o.point)))
+    hypotheses = [guess]
+    rng = np.random.default_rng(0)
+    for trial in range(_TRIALS):
+        a = start if trial == 0 else start + rng.integers(0, count)
+        b = start + count - 1 if trial == 0 else start + rng.integers(0, count)
+        hypotheses.append(_two_view(cameras, o.frame, xy, a, b))
+    stacked = np.stack(hypotheses)
+    errors = [np.minimum(_errors(cameras, o, xy, points, inlier_px), inlier_px) for points in stacked]
+    best = np.argmin([np.add.reduceat(error, start) for error in errors], axis=0)
+    return np.asarray(stacked[best, np.arange(len(start))])
 
 
 def _homogeneous(direction: Array, inverse_distance: Array) -> Array:
@@ -113,7 +120,7 @@ def _two_view(cameras: State, frame: NDArray[np.int64], xy: Array, a: NDArray[np
     return np.where(depth[:, None] < 0.0, -point, point)
 
 
-def _support(cameras: State, o: Observations, xy: Array, points: Array, limit: float) -> Array:
+def _errors(cameras: State, o: Observations, xy: Array, points: Array, limit: float) -> Array:
     """(m,) reprojection errors (undistorted pixels) of homogeneous points; large beyond infinity or behind a camera."""
     rotation, translation = cameras.rotation[o.frame], cameras.translation[o.frame]
     q = camera_points(rotation, translation, points[o.point, :3], points[o.point, 3])

@@ -80,7 +80,7 @@ def typical_error(window: Window) -> float:
 def resting_among(images: list[MappedImage], ids: Index, suspects: NDArray[np.bool_], focal: float) -> Index:
     """Those of the suspected tracks (a part of `ids`) that rest in the image while the others move.
 
-    None where they cover more of the image than captions do: they may be the scene behind something that moves.
+    Empty where they cover more of the image than captions do: they may be the scene behind something that moves.
     """
     if not suspects.any():
         return ids[:0]

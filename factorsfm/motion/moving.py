@@ -41,7 +41,7 @@ def far_off(adjustment: BundleAdjustment) -> NDArray[np.bool_]:
     However many they are: with a third of the points on something that moves, the errors of all are widely spread.
     """
     size = log_errors(adjustment.observations, adjustment.reprojection_errors())
-    return np.asarray(size > np.log(_SIGMAS * adjustment.sigma))
+    return _beyond_tracking(size, adjustment.sigma)
 
 
 def moving_together(
@@ -77,7 +77,11 @@ def moving_together(
 def _beyond(size: NDArray[np.float64], usual: NDArray[np.float64], sigma: float) -> NDArray[np.bool_]:
     """Which logarithms of errors are beyond those of tracking, and beyond the usual ones."""
     center, spread = center_and_spread(usual)
-    return np.asarray((size > np.log(_SIGMAS * sigma)) & (size > center + _SPREADS * spread))
+    return _beyond_tracking(size, sigma) & (size > center + _SPREADS * spread)
+
+
+def _beyond_tracking(size: NDArray[np.float64], sigma: float) -> NDArray[np.bool_]:
+    return np.asarray(size > np.log(_SIGMAS * sigma))
 
 
 def as_exact(adjustment: BundleAdjustment, members: NDArray[np.bool_]) -> NDArray[np.bool_]:

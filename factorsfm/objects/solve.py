@@ -18,6 +18,7 @@ from factorsfm.objects.smooth_errors import smooth_error_covariance
 from factorsfm.objects.start import LEAST_FRAMES, LEAST_TRACKS, object_start
 from factorsfm.polish.polish import polish
 from factorsfm.polish.polished import Polished
+from factorsfm.polish.shot import Shot
 from factorsfm.support.errors import ReconstructionError
 from factorsfm.support.options import Options
 from factorsfm.support.rotations import adjoint
@@ -91,10 +92,10 @@ def solve_object(
     mapped, ids, points = grown(start, images, options)
     focal = np.array([image.camera.mean_focal_length() for image in images])
     zooms = bool(np.ptp(focal) > 0.0)
-    polished = polish(
-        mapped, (ids, points), focal if zooms else focal[:1], replace(options, lens="fixed"),
-        groups=np.arange(len(images)) if zooms else None,
-    )  # fmt: skip
+    shot = Shot.of(
+        mapped, (ids, points), focal if zooms else focal[:1], groups=np.arange(len(images)) if zooms else None
+    )
+    polished = polish(shot, replace(options, lens="fixed"))
     if polished.motion.kind is not ShotKind.GENERAL:
         raise ReconstructionError("it shows too little perspective: its distance and its turning cannot be told apart")
     _check_rigid(polished, mapped, options)

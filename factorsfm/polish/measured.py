@@ -9,7 +9,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from factorsfm.control.known import Control, LocatedControl, locate
+from factorsfm.control.known import Control
+from factorsfm.control.located import LocatedControl, locate
 from factorsfm.control.with_factors import ShotFactors
 from factorsfm.frames.recorded import RecordedFootage, RecordedFrame
 from factorsfm.lens.camera_model import distortion_of
@@ -18,6 +19,7 @@ from factorsfm.lens.rolling_shutter import Recording
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.polish.polish import polish
 from factorsfm.polish.polished import Polished
+from factorsfm.polish.shot import Shot
 from factorsfm.priors.depth_map import DepthKind
 from factorsfm.support.errors import ReconstructionError
 from factorsfm.support.options import Options
@@ -83,16 +85,11 @@ class MeasuredShot:
                 f"frame {self.frames[worst.tracks.position].index}: {worst.message}"
             )
         focal, std = self.first_focal
-        return polish(
+        shot = Shot.of(
             self.images,
             self.map_points,
             np.array([self.camera.mean_focal_length()]),
-            self.options,
-            stage,
-            distortion_of(self.camera) if self.options.estimates_lens else None,
-            control=control,
-            factors=factors,
-            joining=joining,
+            shape=distortion_of(self.camera) if self.options.estimates_lens else None,
             first_focal=(np.array([focal]), std),
             recording=self._recording(),
             suspects=self.suspects,
@@ -100,6 +97,7 @@ class MeasuredShot:
             solved_lens=self.solved_lens,
             seconds=self.footage.seconds(self.frames),
         )
+        return polish(shot, self.options, stage, control=control, factors=factors, joining=joining)
 
     def _located_control(self) -> LocatedControl | None:
         if self.control is None:

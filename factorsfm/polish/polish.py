@@ -20,12 +20,10 @@ from factorsfm.adjustment.residuals import cauchy
 from factorsfm.adjustment.shared_errors import in_scene_unit_with, shared_errors
 from factorsfm.adjustment.state import State
 from factorsfm.adjustment.track_errors import TrackErrors, measure_track_errors
-from factorsfm.control.known import LocatedControl
+from factorsfm.control.located import LocatedControl
 from factorsfm.control.solve import Controlled, frames_under_control, solve_under_control
 from factorsfm.control.with_factors import ShotFactors, solve_with_factors
-from factorsfm.lens.lens import Lens
-from factorsfm.lens.rolling_shutter import Recording, seen_at_once
-from factorsfm.mapping.mapped_images import MappedImage
+from factorsfm.lens.rolling_shutter import seen_at_once
 from factorsfm.motion.stretches import Stretch, stretches
 from factorsfm.polish.connected_frames import connected_frames
 from factorsfm.polish.frames_between import add_frames_between, solved_frames, too_few_tracks
@@ -36,7 +34,6 @@ from factorsfm.polish.start import Core, PolishStart, polish_start
 from factorsfm.support.errors import ReconstructionError
 from factorsfm.support.options import Options, PolishOptions
 from factorsfm.support.status import ShotKind
-from factorsfm.tracks.supervised import SupervisedTracks
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -48,38 +45,17 @@ _FIRST_ITERATIONS = 2  # over all tracks, until their errors are measured
 
 
 def polish(
-    images: list[MappedImage],
-    map_points: tuple[Index, Array],
-    focal: Array,
+    shot: Shot,
     options: Options,
     progress: Callable[[str], None] = lambda stage: None,
-    shape: Array | None = None,
-    groups: Index | None = None,
+    *,
     control: LocatedControl | None = None,
     factors: ShotFactors | None = None,
     joining: Callable[[Polished], ShotFactors | None] | None = None,
-    first_focal: tuple[Array, float] | None = None,
-    recording: Recording | None = None,
-    suspects: Index | None = None,
-    supervised: SupervisedTracks | None = None,
-    solved_lens: Lens | None = None,
-    seconds: Array | None = None,
 ) -> Polished:
     """Triangulate all tracks and minimise over all registered frames.
 
     Args:
-        images: at least one registered; map_points: track ids and positions of the incremental map.
-        focal: (g,) focal lengths, pixels; first guesses where the options refine them.
-        shape: (4,) distortion of the lens as in `residuals.distort` where the options refine the lens; None: the
-            cameras of the images know their distortion.
-        groups: (images,) which of the focal lengths is that of each image; None: all have the first.
-        first_focal: the focal lengths as they were known first, as in `estimate_lens`; None: `focal`.
-        recording: of which the images are all, if their rows may have been read one after another; None: all at once,
-            or in no order of time.
-        suspects: ids (ascending) of tracks that count only where they agree with the others.
-        supervised: tracks of which the errors are known, and that take part however well they fit.
-        solved_lens: see `MeasuredShot`.
-        seconds: (images,) when they were recorded, one after another; None: in no order of time.
         control: known poses, points and lengths; it takes part at the end, and only where the camera moves.
         factors: of the caller, where there is no control; they take part as it does.
         joining: gives factors by the poses that images and prior alone show, where there are none before.
@@ -88,20 +64,16 @@ def polish(
         ReconstructionError: hardly any tracks are left that connect frames, or the control does not determine where its
             world is.
     """
-    shot = Shot.of(
-        images, map_points, focal, shape, groups, first_focal, recording, suspects, supervised, solved_lens,
-        seconds,
-    )  # fmt: skip
-    named = _named(shot, control, factors, options.polish.max_frames // 2)
-    start, frames, left_out = _start(shot, options, named, progress)
+    start, frames, left_out = _start(shot, options, progress, control, factors)
     progress("polish: all tracks")
     adjustment, result = _solved(shot, start, frames, left_out, options.polish)
-    if control is not None and start.core.motion.kind is ShotKind.GENERAL:
+    moves = start.core.motion.kind is ShotKind.GENERAL
+    if control is not None and moves:
         progress("polish: control")
         _put_under_control(result, adjustment, control, shot)
-    if joining is not None and start.core.motion.kind is ShotKind.GENERAL:
+    if joining is not None and moves:
         factors = joining(result)
-    if factors is not None and start.core.motion.kind is ShotKind.GENERAL:
+    if factors is not None and moves:
         progress("polish: factors")
         _respect_factors(result, adjustment, factors, shot)
     if result.control is None and (control is not None or factors is not None):
@@ -119,12 +91,13 @@ def polish(
 
 
 def _start(
-    shot: Shot, options: Options, named: Callable[[list[int]], list[int]], progress: Callable[[str], None]
+    shot: Shot,
+    options: Options,
+    progress: Callable[[str], None],
+    control: LocatedControl | None,
+    factors: ShotFactors | None,
 ) -> tuple[PolishStart, list[int], dict[int, str]]:
     """Where the solution starts, the positions of its frames, and why others are left out.
-
-    Args:
-        named: gives those of some frames that must be solved for, since something is known of them.
 
     A frame of which hardly any track is left among those that fit the cameras is not determined: all is done again
     without it.
@@ -139,7 +112,7 @@ def _start(
                 "frames, at least 2 needed"
             )
         frames = solved_frames(shot.images, registered, o.max_frames)
-        frames = sorted({*frames, *named(registered)})
+        frames = sorted({*frames, *_named(registered, control, factors, o.max_frames // 2)})
         tracks = shot.long_tracks(frames, min(o.min_track_length, max(2, len(frames))))
         observations = shot.observations(frames, tracks)
         unconnected = _unconnected(observations.of(shot.trusted(tracks)), frames, least)
@@ -152,16 +125,14 @@ def _start(
         left_out.update(unconnected)
 
 
-def _named(
-    shot: Shot, control: LocatedControl | None, factors: ShotFactors | None, limit: int
-) -> Callable[[list[int]], list[int]]:
-    """Which of some registered frames control or factors name; of very many, some."""
+def _named(registered: list[int], control: LocatedControl | None, factors: ShotFactors | None, limit: int) -> list[int]:
+    """Which registered frames must be solved for, since control or factors name them; of very many, some."""
     if control is not None:
-        return lambda registered: frames_under_control(registered, control, limit)
+        return frames_under_control(registered, control, limit)
     names = factors.frames if factors is not None else []
     if len(names) > limit:
         names = [names[k] for k in np.linspace(0, len(names) - 1, limit).astype(int)]
-    return lambda registered: sorted({*names} & {*registered})
+    return sorted({*names} & {*registered})
 
 
 def _unconnected(observations: Observations, frames: list[int], least: int) -> dict[int, str]:

@@ -55,19 +55,33 @@ class Shot:
         images: list[MappedImage],
         map_points: tuple[Index, Array],
         focal: Array,
-        distortion: Array | None,
-        groups: Index | None,
-        first_focal: tuple[Array, float] | None,
-        recording: Recording | None,
-        suspects: Index | None,
-        supervised: SupervisedTracks | None,
-        solved_lens: Lens | None,
-        seconds: Array | None,
+        *,
+        shape: Array | None = None,
+        groups: Index | None = None,
+        first_focal: tuple[Array, float] | None = None,
+        recording: Recording | None = None,
+        suspects: Index | None = None,
+        supervised: SupervisedTracks | None = None,
+        solved_lens: Lens | None = None,
+        seconds: Array | None = None,
     ) -> Shot:
-        """A shot whose lens is estimated where a distortion is given: its tracks keep their distorted pixels then."""
+        """A shot whose lens is estimated where a shape is given: its tracks keep their distorted pixels then.
+
+        Args:
+            images: at least one registered; map_points: track ids and positions of the incremental map.
+            focal: (g,) focal lengths, pixels; first guesses where the options refine them.
+            shape: (4,) distortion of the lens as in `residuals.distort` where the options refine the lens; None: the
+                cameras of the images know their distortion.
+            groups: (images,) which of the focal lengths is that of each image; None: all have the first.
+            first_focal: the focal lengths as they were known first, as in `estimate_lens`; None: `focal`.
+            recording: of which the images are all, if their rows may have been read one after another; None: all at
+                once, or in no order of time.
+            suspects, supervised, solved_lens: see `MeasuredShot`; None: none.
+            seconds: (images,) when they were recorded, one after another; None: in no order of time.
+        """
         guess = Lens(focal)
-        if distortion is not None:
-            guess = Lens(focal, np.r_[distortion, np.zeros(2)])
+        if shape is not None:
+            guess = Lens(focal, np.r_[shape, np.zeros(2)])
             images = [replace(image, tracks=_distorted(image.tracks)) for image in images]
         group = np.zeros(len(images), np.int64) if groups is None else groups
         suspects = np.zeros(0, np.int64) if suspects is None else suspects

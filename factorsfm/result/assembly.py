@@ -14,7 +14,6 @@ from factorsfm.adjustment.observations import DISTORTION
 from factorsfm.camera.projection import with_focal
 from factorsfm.lens.camera_model import with_distortion
 from factorsfm.lens.lens import LensEstimate
-from factorsfm.lens.rolling_shutter import Shutter
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.motion.stretches import Stretch
 from factorsfm.polish.polished import Polished
@@ -79,10 +78,8 @@ def assemble(
         parallax=parallax(camera_centers(state.rotation, state.translation), state.inverse_distance),
         point_std=polished.point_std[kept] / state.inverse_distance[kept] if general else None,
         noise=observations.noise,
-        lens=None if polished.lens is None else _lens_fit(polished.lens),
-        shutter=None
-        if polished.shutter is None
-        else _rolling_shutter(polished.shutter, recorded=polished.recorded, error=polished.shutter_error),
+        lens=_lens_fit(polished.lens),
+        shutter=_rolling_shutter(polished),
         rolled=observations.rolled,
         metric=scale is not None,
         control=polished.control,
@@ -203,13 +200,17 @@ def _solved_camera(polished: Polished, camera: pycolmap.Camera) -> pycolmap.Came
     return with_distortion(camera, focal, lens.shape) if lens.bends else with_focal(camera, focal)
 
 
-def _rolling_shutter(shutter: Shutter, *, recorded: bool, error: float) -> RollingShutter:
+def _rolling_shutter(polished: Polished) -> RollingShutter | None:
+    if (shutter := polished.shutter) is None:
+        return None
     columns, rows = shutter.readout.tolist()
     along: Literal["rows", "columns"] = "rows" if rows else "columns"
-    return RollingShutter(rows or columns, shutter.std, along, recorded, error)
+    return RollingShutter(rows or columns, shutter.std, along, polished.recorded, polished.shutter_error)
 
 
-def _lens_fit(estimate: LensEstimate) -> LensFit:
+def _lens_fit(estimate: LensEstimate | None) -> LensFit | None:
+    if estimate is None:
+        return None
     k1, k2, x, y = (float(std) if np.isfinite(std) else None for std in estimate.shape_std[DISTORTION])
     focal_std = float(estimate.focal_std.max()) if estimate.determined or estimate.rough else 0.0
     return LensFit(estimate.determined, focal_std or None, k1, k2, x, y, estimate.zoom_std)

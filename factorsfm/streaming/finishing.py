@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from factorsfm.camera.guess import first_focal_std
@@ -21,12 +20,13 @@ from factorsfm.mending.joined import joined
 from factorsfm.mending.user_tracks import UserTracks
 from factorsfm.polish.measured import MeasuredShot
 from factorsfm.polish.polished import Polished
-from factorsfm.priors.depth import DepthPrior
 from factorsfm.result.reconstruction import Reconstruction
 from factorsfm.result.solved_shot import solved_shot
+from factorsfm.streaming.depth_reader import DepthReader
 from factorsfm.streaming.frame_update import SeenFrame
 from factorsfm.streaming.imu_result import add_imu
 from factorsfm.streaming.imu_source import FramePoses, ImuSource
+from factorsfm.streaming.stream_camera import StreamCamera
 from factorsfm.support.options import Options
 from factorsfm.support.progress import Progress
 from factorsfm.support.stages import StageSeconds
@@ -42,8 +42,7 @@ class EndedShot:
     Attributes:
         frames: as they came; images: of these, registered on the map as it is at last; mapper: has made it.
         colors: (n, 3) RGB by track id.
-        camera: the lens of the mapper's images; lens_given: whether it is known, and no guess.
-        depth: the prior; without_depth: why it failed, by the frame's index.
+        camera: of the mapper's images; depth: the prior, and where it failed.
         control: what is known beforehand; imu: beside the stream; footage: how the frames were recorded.
         seconds: of the stages so far; that of the polish is added.
         suspects: ids of the tracks that count only where they agree with the others.
@@ -54,10 +53,8 @@ class EndedShot:
     images: list[MappedImage]
     mapper: Mapper
     colors: NDArray[np.uint8]
-    camera: pycolmap.Camera
-    lens_given: bool
-    depth: DepthPrior | None
-    without_depth: Mapping[int, str]
+    camera: StreamCamera
+    depth: DepthReader
     control: Control | None
     imu: ImuSource | None
     footage: RecordedFootage
@@ -86,21 +83,22 @@ class EndedShot:
     def _measured(self) -> MeasuredShot:
         """What the polish takes from the stream."""
         notes = []
-        if self.without_depth:
-            count, first = len(self.without_depth), next(iter(self.without_depth.values()))
+        if failed := self.depth.failed:
+            count, first = len(failed), next(iter(failed.values()))
             notes.append(f"Frames that went without depth because the prior failed: {count}; {first}.")
         if self.mapper.without_prior:
             notes.append(f"The map went on without the depth prior: {self.mapper.without_prior}.")
+        camera, given = self.camera.known, self.camera.given
         measured = MeasuredShot(
             frames=[RecordedFrame(frame.index, frame.name, frame.timestamp) for frame in self.frames],
             footage=self.footage,
             images=self.images,
             map_points=self.mapper.points.all(),
             colors=self.colors,
-            camera=self.camera,
-            lens_given=self.lens_given,
-            first_focal=(self.mapper.first_focal, first_focal_std(self.camera, given=self.lens_given)),
-            depth_kind=None if self.depth is None else self.depth.kind,
+            camera=camera,
+            lens_given=given,
+            first_focal=(self.mapper.first_focal, first_focal_std(camera, given=given)),
+            depth_kind=None if self.depth.prior is None else self.depth.prior.kind,
             suspects=self.suspects,
             supervised=SupervisedTracks.none(),
             options=self.options,

@@ -14,10 +14,7 @@ from factorsfm.frames.texture import BLANK_TEXTURE
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.mapping.mapper import Mapper
 from factorsfm.result.frame_results import pose_of
-from factorsfm.support.errors import InputError
 from factorsfm.support.status import FrameStatus
-
-_LEAST_SIDE = 32  # pixels: room for the patches of the tracker
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,19 +83,6 @@ class FrameUpdate:
     repeats: int | None = None
 
 
-def check_size(frame: Frame, size: tuple[int, int] | None) -> None:
-    """Refuse a frame of another size (width, height) than those before, or a first one that is too small.
-
-    Raises:
-        InputError: it is one.
-    """
-    height, width = frame.image.shape[:2]
-    if size is None and min(height, width) < _LEAST_SIDE:
-        raise InputError(f"the images have {width}x{height} pixels; at least {_LEAST_SIDE} on each side are needed")
-    if size is not None and (width, height) != size:
-        raise InputError(f"frame {frame.index} is {width}x{height}, expected {size[0]}x{size[1]} as the frames before")
-
-
 class FrameIndices:
     """Indices that name the variables of frames: their own, or the next free one where another frame has that."""
 
@@ -117,11 +101,12 @@ def frame_update(
     frame: Frame, image: MappedImage, mapper: Mapper, frames: Sequence[SeenFrame], *, focal_changed: bool
 ) -> FrameUpdate:
     """What is known of the newest frame; `image` is that of the mapper, `frames` are all that came."""
+    news = mapper.news
     return FrameUpdate(
         frame.index, image.status, image.message, pose_of(image), image.keyframe, len(image.tracks.ids),
-        image.inliers, mapper.new_points, mapper.parallax, image.covariance, _newest_prior(mapper, frames),
+        image.inliers, news.points, mapper.parallax, image.covariance, _newest_prior(mapper, frames),
         mapper.at_odds, frame.dropped, focal_length=mapper.focal, focal_changed=focal_changed,
-        starts_anew=mapper.starts_anew or mapper.begins_again, note=mapper.note,
+        starts_anew=news.starts_anew or news.begins_again, note=news.note,
     )  # fmt: skip
 
 

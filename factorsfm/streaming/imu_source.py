@@ -133,7 +133,7 @@ class ImuSource:
             self._add_factors(mapper, finished=True)
 
     def _add_factors(self, mapper: Mapper, *, finished: bool) -> None:
-        if mapper.starts_anew:
+        if mapper.news.starts_anew:
             self._last, self.reason = None, "the map was started anew"
         if len(mapper.keyframes) == self._seen and not finished:
             return

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from contextlib import ExitStack
 from dataclasses import asdict, astuple
 from pathlib import Path
@@ -18,7 +17,6 @@ from factorsfm.frames.texture import BLANK_TEXTURE
 from factorsfm.graph.contents import Factors, LiveGraph, Values, empty_graph
 from factorsfm.graph.process import GraphProcess
 from factorsfm.inertial.recording import ImuRecording
-from factorsfm.lens.camera_model import distortion_of
 from factorsfm.mapping.graph_updates import UPDATES
 from factorsfm.mapping.mapper import Mapper
 from factorsfm.mending.user_tracks import UserTracks
@@ -38,7 +36,6 @@ from factorsfm.streaming.frame_update import (
     FrameIndices,
     FrameUpdate,
     SeenFrame,
-    check_size,
     frame_update,
     keyframe_times,
     mark_blank,
@@ -46,6 +43,7 @@ from factorsfm.streaming.frame_update import (
 from factorsfm.streaming.horizon import FRAMES, Horizon, recent
 from factorsfm.streaming.imu_source import ImuSource, restore_imu
 from factorsfm.streaming.snapshot import read_snapshot, write_snapshot
+from factorsfm.streaming.stream_camera import StreamCamera
 from factorsfm.streaming.suspicion import Suspicion
 from factorsfm.streaming.view_finder import ViewFinder
 from factorsfm.support.context import Closing
@@ -58,8 +56,6 @@ from factorsfm.support.threads import OneThreadEach
 from factorsfm.tracks.colors import TrackColors
 from factorsfm.tracks.flow import FlowTracker
 from factorsfm.tracks.image_tracks import ImageTracks
-
-_STATE = ("camera", "_size", "_lens_given")
 
 
 class Stream(Closing):
@@ -91,7 +87,7 @@ class Stream(Closing):
     ) -> None:
         if control is not None and imu is not None:
             raise InputError("control and an IMU cannot both set the scale; give one of them")
-        self.camera, self._lens_given = camera, camera is not None
+        self._camera = StreamCamera(camera)
         self._imu = ImuSource(imu) if imu is not None else None
         self.control = control
         self.options = options or Options()
@@ -106,7 +102,6 @@ class Stream(Closing):
         self._thumbnails = self._held.enter_context(Thumbnails())
         self._graph = self._held.enter_context(GraphProcess(UPDATES))  # it starts while the source opens
         self._mapper: Mapper | None = None
-        self._size = (0, 0)
         self._colors = TrackColors()
         self._indices = FrameIndices()
         self._footage = Footage()
@@ -127,8 +122,8 @@ class Stream(Closing):
         frame = as_frame(frame, len(self.frames))
         time = self._imu.check_time(frame.index, frame.timestamp) if self._imu is not None else 0.0
         mapper = self._mapper = self._mapper or self._open(frame)
-        focal_changed = self._follow_focal(mapper)
-        check_size(frame, self._size)
+        focal_changed = self._camera.follow(mapper)
+        self._camera.check_size(frame)
         frame, grey = self._footage.seen(frame)
         mapper.frame_rate = self._tracker.frame_rate = self._footage.pace.rate
         with self.seconds.of("masks"):
@@ -140,9 +135,9 @@ class Stream(Closing):
         self._colors.remember(frame.image, tracked.ids, tracked.xy)
         with self.seconds.of("mapping"):
             mapper.advance()
-        focal_changed |= self._follow_focal(mapper)
+        focal_changed |= self._camera.follow(mapper)
         index = self._indices.take(frame.index)
-        tracks = ImageTracks(len(self.frames), tracked.ids, tracked.xy, self.camera, index=index)
+        tracks = ImageTracks(len(self.frames), tracked.ids, tracked.xy, self._camera.known, index=index)
         tracks = tracks.of(tracks.invertible & (tracked.texture >= BLANK_TEXTURE))  # a blank image's tracks are noise
         with self.seconds.of("masks"):
             tracks = self._suspicion.of_scene(frame, tracks, mapper)
@@ -152,18 +147,23 @@ class Stream(Closing):
             image = mapper.add(tracks, lambda: self._read_depth(frame, tracks.pixels), keyframe=keyframe)
             if self._imu is not None:
                 self._imu.follow(mapper, time)
-        focal_changed |= self._follow_focal(mapper)
+        focal_changed |= self._camera.follow(mapper)
         self.frames.append(SeenFrame(frame.index, frame.name, frame.timestamp, tracked.texture))
         self._thumbnails.add(frame.image)
-        if len(mapper.burn_ins):
-            self._tracker.avoid(mapper.burn_ins)
-            mapper.forget_tracks(mapper.burn_ins)
+        if len(burn_ins := mapper.news.burn_ins):
+            self._tracker.avoid(burn_ins)
+            mapper.forget_tracks(burn_ins)
         with self.seconds.of("relocalization"):
             self._finder.keep_in_sight(mapper, image, grey)
         self._horizon.follow(mapper, self._finder.relocalizer)
         if image.status is not FrameStatus.WAITING:  # it may still take part in the start
             mark_blank(mapper, len(self.frames) - 1, tracked.texture)
         return self._footage.told(frame_update(frame, image, mapper, self.frames, focal_changed=focal_changed))
+
+    @property
+    def camera(self) -> pycolmap.Camera | None:
+        """The lens as it is known now; None before the first frame where it was not given."""
+        return self._camera.newest
 
     def trajectory(self) -> list[pycolmap.Rigid3d | None]:
         """`cam_from_world` of every frame so far as the graph knows it now, None where it has none.
@@ -257,7 +257,7 @@ class Stream(Closing):
         write_snapshot(
             Path(path),
             {
-                **{name: getattr(self, name) for name in _STATE},
+                **self._camera.state(),
                 "options": self.options.to_dict(),
                 "without_depth": self._depth.failed,
                 "seconds": dict(self.seconds),
@@ -300,8 +300,7 @@ class Stream(Closing):
         return stream
 
     def _restore(self, state: dict[str, Any]) -> None:
-        for name in _STATE:
-            setattr(self, name, state[name])
+        self._camera.restore(state)
         self._depth.failed = state["without_depth"]
         self.seconds.update(state["seconds"])
         self.frames = [SeenFrame(*frame) for frame in state["frames"]]
@@ -346,15 +345,13 @@ class Stream(Closing):
         with self.seconds.of("mapping"):
             self._mapper.finish(self._imu.finish if self._imu is not None else lambda mapper: None)
             suspects = self._suspicion.end(self._mapper)
-        self._follow_focal(self._mapper)
+        self._camera.follow(self._mapper)
         for position, seen in enumerate(self.frames):
             mark_blank(self._mapper, position, seen.texture)
-        assert self.camera is not None
         begin = self._horizon.begin
         return EndedShot(
             frames=self.frames[begin:], images=recent(self._mapper.images, begin), mapper=self._mapper,
-            colors=self._colors.table, camera=self.camera, lens_given=self._lens_given, depth=self._depth.prior,
-            without_depth=self._depth.failed, control=self.control, imu=self._imu,
+            colors=self._colors.table, camera=self._camera, depth=self._depth, control=self.control, imu=self._imu,
             footage=self._footage.recorded.of(range(begin, len(self.frames))), options=self.options,
             seconds=self.seconds, suspects=suspects, tracks=tracks,
         )  # fmt: skip
@@ -370,28 +367,15 @@ class Stream(Closing):
 
     def _open(self, frame: Frame) -> Mapper:
         """Everything that waits for the size of the first frame."""
-        check_size(frame, None)
         if self.camera is None:
             self.options = self.options.for_unknown_lens()
-        self.camera = self._footage.opened(frame, self.camera)
-        if self.options.estimates_lens:
-            distortion_of(self.camera)  # refuses what cannot be estimated
-        self._size = (self.camera.width, self.camera.height)
+        self._camera.open(frame, self._footage, self.options)
         return self._new_mapper()
 
-    def _follow_focal(self, mapper: Mapper) -> bool:
-        """Take over the camera of the mapper's images; whether it has another focal length."""
-        assert self.camera is not None
-        if math.isclose(mapper.focal, self.camera.mean_focal_length(), rel_tol=1e-12):
-            return False
-        self.camera = mapper.images[-1].tracks.camera
-        return True
-
     def _new_mapper(self) -> Mapper:
-        assert self.camera is not None
         self._held.enter_context(OneThreadEach())
-        focal, has_prior = self.camera.mean_focal_length(), self._depth.prior is not None
-        return Mapper(self._graph, focal, self._size[0], self.options, has_prior=has_prior)
+        camera, has_prior = self._camera.known, self._depth.prior is not None
+        return Mapper(self._graph, camera.mean_focal_length(), camera.width, self.options, has_prior=has_prior)
 
     def _read_depth(self, frame: Frame, xy: NDArray[np.float64]) -> ImageDepth | None:
         with self.seconds.of("depth"):

@@ -186,6 +186,19 @@ class Options:
         """The options for a shot without a camera: "auto" becomes "distortion"."""
         return replace(self, lens="distortion") if self.lens == "auto" else self
 
+    def for_image_sets(self) -> Options:
+        """The options for images in any order: wrong matches are single observations, and two views make a track.
+
+        Keypoints are less exact than tracks of a video. Where views are far apart the prior adds nothing to
+        triangulation and graph; the paper's presets triangulate with it all the same.
+        """
+        depth = self.mapper.triangulation_depth
+        mapper = replace(
+            self.mapper, pixel_sigma=0.5, graph_depth=False, triangulation_depth="none" if depth == "inverse" else depth
+        )
+        polish = replace(self.polish, min_track_length=2, final_iterations=20, observation_sigmas=12.0, doubtful_px=0.6)
+        return replace(self, mapper=mapper, polish=polish)
+
     @property
     def uses_depth(self) -> bool:
         """Whether any step reads the depth prior."""
@@ -199,8 +212,9 @@ class Options:
         )
 
 
-def _variant(name: str, mapper: MapperOptions, *, polish_depth: bool = False) -> Options:
-    return replace(Options(), preset=name, mapper=mapper, polish=replace(PolishOptions(), depth=polish_depth))
+def _variant(name: str, mapper: MapperOptions) -> Options:
+    """A preset without the prior in the polish."""
+    return replace(Options(), preset=name, mapper=mapper, polish=replace(PolishOptions(), depth=False))
 
 
 _PAPER = MapperOptions(

@@ -60,15 +60,11 @@ class TrackedFrame:
     Attributes:
         ids: (n,) identities, never used again; empty if the frame is blank beside the previous one.
         xy: (n, 2) pixels, centres at integers.
-        lost: number of tracks that ended in this frame.
-        born: number of tracks that start in this frame.
         texture: standard deviation of the Laplacian at the scale of a feature (grey levels); near 0 in a blank frame.
     """
 
     ids: NDArray[np.int64]
     xy: NDArray[np.float64]
-    lost: int
-    born: int
     texture: float
 
 
@@ -138,20 +134,18 @@ class FlowTracker(Closing):
         frame = GreyFrame.of(grey)
         texture = frame.texture
         if self._is_blank(texture):  # the tracks wait for the next frame that shows something
-            return TrackedFrame(np.zeros(0, np.int64), np.zeros((0, 2)), 0, 0, texture)
-        before = len(self._tracks)
-        if self._previous is not None and before:
+            return TrackedFrame(np.zeros(0, np.int64), np.zeros((0, 2)), texture)
+        if self._previous is not None and len(self._tracks):
             self._follow(self._previous, frame, mask)
-        lost = before - len(self._tracks)
         if self._lost_view is not None:
             self._look_for(self._lost_view, frame)
         if expected is not None:
             self.revive(grey, *expected)
-        born = self._replenish(frame, mask)
+        self._replenish(frame, mask)
         self._previous, self._texture = frame, texture
         self._frame += 1
         self._tracks.patches.warp_ahead(self._pool)
-        return TrackedFrame(self._tracks.ids.copy(), self._tracks.xy.astype(np.float64), lost, born, texture)
+        return TrackedFrame(self._tracks.ids.copy(), self._tracks.xy.astype(np.float64), texture)
 
     def close(self) -> None:
         """Let the threads go; no further image can be tracked."""
@@ -311,15 +305,15 @@ class FlowTracker(Closing):
         if len(rows):
             self._ended.add(self._tracks.ids[rows], self._tracks.patches.take(rows), ready_from)
 
-    def _replenish(self, frame: GreyFrame, mask: Flags | None) -> int:
-        """Start tracks at new corners; returns how many."""
+    def _replenish(self, frame: GreyFrame, mask: Flags | None) -> None:
+        """Start tracks at new corners."""
         o, alive = self.options, len(self._tracks)
         room = o.max_tracks - alive
         if room < o.max_tracks * o.replenish_below:
-            return 0
+            return
         interval = frames_in(_REPLENISH_SECONDS, self.frame_rate)
         if alive > _REPLENISH_SHARE * o.max_tracks and self._frame - self._replenished < interval:
-            return 0
+            return
         self._replenished = self._frame
         corners = new_corners(frame, self._tracks.xy, self._avoided, mask, room, o)
         if len(corners):
@@ -328,7 +322,6 @@ class FlowTracker(Closing):
             ids = np.arange(self._next_id, self._next_id + len(corners))
             self._tracks.append(ids, corners, self._local_velocity(corners), born)
             self._next_id += len(corners)
-        return len(corners)
 
     def _local_velocity(self, xy: Array) -> Array:
         """(n, 2) velocity of points that were not followed into this frame: that of their neighbours."""

@@ -32,7 +32,7 @@ from factorsfm.adjustment.problem import ErrorModel, Known
 from factorsfm.adjustment.state import State
 from factorsfm.camera.projection import PIXEL_CENTER
 from factorsfm.cli import main as cli
-from factorsfm.control.known import LocatedControl, locate
+from factorsfm.control.located import LocatedControl, locate
 from factorsfm.control.residuals import (
     ALIGNMENT,
     ControlTerm,
@@ -47,6 +47,7 @@ from factorsfm.control.residuals import (
 from factorsfm.control.solve import _by_size
 from factorsfm.evaluation.readers import read_shot
 from factorsfm.polish.polish import Polished, polish
+from factorsfm.polish.shot import Shot
 from factorsfm.support.similarity import Similarity, align, pose_arrays
 from factorsfm.synthetic import render_shot, write_shot
 from tests.calibration import assert_calibrated, normalised
@@ -198,9 +199,10 @@ def solve(problem: Problem, control: Control | None, start: State | None = None)
     ids = np.arange(len(problem.points))
     options = replace(Options(), polish=PolishOptions(final_iterations=20, tolerance=1e-8))
     return polish(
-        images, (ids, problem.points), np.array([problem.focal]), options,
+        Shot.of(images, (ids, problem.points), np.array([problem.focal])),
+        options,
         control=None if control is None else located(problem, control),
-    )  # fmt: skip
+    )
 
 
 def placed(result: Polished) -> tuple[np.ndarray, np.ndarray]:
@@ -447,9 +449,9 @@ def test_control_of_frames_without_a_pose_cannot_be_used(exact: Problem) -> None
         images[k].status = FrameStatus.LOST
     points = np.arange(len(exact.points)), exact.points
     with pytest.raises(ReconstructionError, match=r"2 positions on a line .*as far as frames are registered"):
-        polish(images, points, np.array([exact.focal]), Options(), control=located(exact, Control(known)))
+        polish(Shot.of(images, points, np.array([exact.focal])), Options(), control=located(exact, Control(known)))
     more = Control([*known, known_pose(exact, 1, SIGMA)])
-    result = polish(images, points, np.array([exact.focal]), Options(), control=located(exact, more))
+    result = polish(Shot.of(images, points, np.array([exact.focal])), Options(), control=located(exact, more))
     assert result.control is not None
     assert len(result.control.residuals) == 3
     assert [text.split(",")[0] for text in result.control.unused] == [
@@ -477,9 +479,10 @@ def test_a_long_shot_is_held_where_it_is_known() -> None:
     options = replace(Options(), polish=PolishOptions(final_iterations=20, tolerance=1e-8, max_frames=4))
     points = np.arange(len(problem.points)), problem.points
     result = polish(
-        mapped_images(problem, problem.truth), points, np.array([problem.focal]), options,
+        Shot.of(mapped_images(problem, problem.truth), points, np.array([problem.focal])),
+        options,
         control=located(problem, Control(known)),
-    )  # fmt: skip
+    )
     assert result.frames == list(range(16))
     _, position = placed(result)
     off = np.abs(position - true_centers(problem)).max(axis=1)

@@ -13,7 +13,8 @@ import pytest
 from numpy.typing import NDArray
 
 from factorsfm.control.files import read_control
-from factorsfm.control.known import Control, KnownDistance, KnownPose, MarkedPoint, find_frames
+from factorsfm.control.known import Control, KnownDistance, KnownPose, MarkedPoint
+from factorsfm.control.located import find_frames
 from factorsfm.export import ExportOptions, export
 from factorsfm.result.reconstruction import Reconstruction
 from factorsfm.support.errors import InputError

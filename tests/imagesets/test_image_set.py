@@ -32,10 +32,13 @@ from factorsfm.export import export
 from factorsfm.frames.unordered import Unusable, looks_unordered, other_files, read_images
 from factorsfm.imagesets.cameras import find_cameras
 from factorsfm.imagesets.covisibility import common_tracks, longest_tracks, pyramid_score
-from factorsfm.imagesets.image_set import ImageSet, _by_reason
-from factorsfm.imagesets.mapper import SetMapper, for_image_sets, map_parts
+from factorsfm.imagesets.image_set import ImageSet
+from factorsfm.imagesets.mapper import SetMapper
+from factorsfm.imagesets.parts import map_parts
 from factorsfm.imagesets.photo_folder import Photo, PhotoFolder
+from factorsfm.imagesets.photo_results import by_reason
 from factorsfm.polish.polish import Polished, polish
+from factorsfm.polish.shot import Shot
 from factorsfm.priors.image_depth import ImageDepth
 from factorsfm.support.similarity import pose_arrays
 from factorsfm.synthetic import RenderedShot, render_shot, render_views, room_camera
@@ -88,11 +91,11 @@ class Ring:
 
 
 def solve(tracks: list[ImageTracks], options: Options | None = None, focal: float = FOCAL) -> Polished:
-    options = for_image_sets(options or Options())
+    options = (options or Options()).for_image_sets()
     mapper = SetMapper(tracks, focal, options)
     mapper.run()
     assert all(image.registered for image in mapper.images)
-    return polish(mapper.images, mapper.points.all(), np.array([mapper.focal]), options)
+    return polish(Shot.of(mapper.images, mapper.points.all(), np.array([mapper.focal])), options)
 
 
 def test_wide_baselines_with_wrong_matches_in_any_order() -> None:
@@ -129,7 +132,7 @@ def test_the_papers_steps_use_depth_on_a_set(preset: str) -> None:
     """Registration finds gamma and beta, triangulation holds points to them (paper, equations 2 to 4)."""
     ring = Ring(cameras=5, points=600)
     tracks = with_depth(ring, ring.tracks(noise_px=0.3), scale=2.0, shift=0.5)
-    mapper = SetMapper(tracks, FOCAL, for_image_sets(factorsfm.PRESETS[preset]))
+    mapper = SetMapper(tracks, FOCAL, factorsfm.PRESETS[preset].for_image_sets())
     mapper.run()
     assert registered(mapper) == list(range(5))
     affines = [image.affine for image in mapper.images if image.affine is not None]
@@ -145,7 +148,7 @@ def test_the_papers_steps_use_depth_on_a_set(preset: str) -> None:
 
 def test_an_image_that_the_map_contradicts_is_registered_again() -> None:
     ring = Ring()
-    mapper = SetMapper(ring.tracks(), FOCAL, for_image_sets(Options()))
+    mapper = SetMapper(ring.tracks(), FOCAL, Options().for_image_sets())
     mapper.run()
     spoiled, sound = mapper.images[3], mapper.images[3].pose
     turn = cv2.Rodrigues(np.array([0.0, 0.6, 0.1]))[0]
@@ -479,7 +482,7 @@ def test_format_and_focal_length_tell_cameras_apart() -> None:
 
 def test_what_is_said_of_many_photographs_is_said_once() -> None:
     said = [("a", "blank"), *((f"p{k}", "reduced") for k in range(7)), ("b", ""), ("c", "blank")]
-    assert _by_reason(said) == ["a, c: blank.", "p0, p1, p2, p3, p4, … (7 in all): reduced."]
+    assert by_reason(said) == ["a, c: blank.", "p0, p1, p2, p3, p4, … (7 in all): reduced."]
 
 
 def test_a_duplicate_that_lies_on_its_side(shot: RenderedShot, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 from factorsfm import Options
 from factorsfm.camera.projection import with_focal
 from factorsfm.graph.keyframe_graph import KeyframeGraph
-from factorsfm.imagesets.mapper import SetMapper, for_image_sets
+from factorsfm.imagesets.mapper import SetMapper
 from factorsfm.imagesets.set_update import update_set
 from factorsfm.mapping.map_copy import MapCopy, MapUpdate
 from factorsfm.mapping.mapped_images import MappedImage
@@ -19,7 +19,7 @@ FREE = 6  # images that an update solves for
 
 
 def solved(cameras: int = 11, **kwargs: float) -> SetMapper:
-    mapper = SetMapper(Ring(cameras, points=900).tracks(**kwargs), FOCAL, for_image_sets(Options()))
+    mapper = SetMapper(Ring(cameras, points=900).tracks(**kwargs), FOCAL, Options().for_image_sets())
     mapper.run()
     assert all(image.registered for image in mapper.images)
     return mapper
@@ -119,7 +119,7 @@ class Counting(SetMapper):
 
 
 def test_a_map_that_fits_is_adjusted_as_a_whole_only_when_it_has_doubled() -> None:
-    mapper = Counting(Ring(14).tracks(wrong=0.05), FOCAL, for_image_sets(Options()))
+    mapper = Counting(Ring(14).tracks(wrong=0.05), FOCAL, Options().for_image_sets())
     mapper.run()
     assert mapper.adjusted == [2, 4, 8, 14, 14]  # at last on all tracks
     assert mapper.updated == [3, 5, 6, 7, 9, 10, 11, 12, 13, 14]
@@ -128,7 +128,7 @@ def test_a_map_that_fits_is_adjusted_as_a_whole_only_when_it_has_doubled() -> No
 def test_a_focal_length_that_is_open_is_refined_until_it_changes_little() -> None:
     guess = 1.2 * FOCAL
     tracks = [replace(t, camera=with_focal(t.camera, guess)) for t in Ring(10).tracks()]
-    mapper = Counting(tracks, guess, for_image_sets(Options(lens="focal")))
+    mapper = Counting(tracks, guess, Options(lens="focal").for_image_sets())
     mapper.run()
     assert mapper.focal == pytest.approx(FOCAL, rel=1e-3)
     assert mapper.adjusted == [2, 3, 4, 5, 10, 10]  # with four images it is refined first

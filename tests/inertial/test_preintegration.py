@@ -5,7 +5,6 @@ import pytest
 
 from factorsfm.inertial.preintegration import inertial_steps, preintegrate
 from factorsfm.inertial.recording import ImuNoise
-from factorsfm.inertial.rotations import gyroscope_rotations
 from factorsfm.support.errors import InputError
 from factorsfm.support.rotations import logarithm
 from factorsfm.synthetic.imu import handheld_path, simulate_imu
@@ -86,17 +85,3 @@ def test_steps_end_where_the_interval_ends():
 def test_an_interval_outside_the_recording_is_refused(starts, ends, message):
     with pytest.raises(InputError, match=message):
         preintegrate(recording(), np.array(starts), np.array(ends), *BIASES)
-
-
-def test_rotations_from_the_gyroscope_alone():
-    """Errors of noise and of the bias, against their covariance."""
-    bias_covariance = np.diag([1e-3, 2e-3, 3e-3]) ** 2
-    rng = np.random.default_rng(0)
-    chi = []
-    for seed in range(100):
-        bias = BIASES[0] + np.sqrt(np.diag(bias_covariance)) * rng.standard_normal(3)
-        found = gyroscope_rotations(recording(noise=ImuNoise(), seed=seed), STARTS, ENDS, bias, bias_covariance)
-        errors = logarithm(true_motion()[0].swapaxes(1, 2) @ found.start_from_end)
-        chi.append([e @ np.linalg.solve(c, e) / 3 for e, c in zip(errors, found.covariance, strict=True)])
-    assert (abs(np.mean(chi, axis=0) - 1.0) < 0.25).all()
-    assert np.degrees(np.sqrt(found.covariance[0].max())) < 0.06  # over 0.3 s

@@ -24,6 +24,7 @@ from factorsfm.lens.solver import LensSolver
 from factorsfm.polish import start
 from factorsfm.polish.camera_starts import _everywhere
 from factorsfm.polish.polish import polish
+from factorsfm.polish.shot import Shot
 from factorsfm.result.notes import lens_note
 from factorsfm.support.errors import InputError
 from factorsfm.support.options import DETERMINED_FOCAL_STD, GIVEN_FOCAL_STD, Options, PolishOptions
@@ -42,7 +43,7 @@ def estimated(problem, *, guess=1.3, shape=None, lens="distortion", first_std=No
     points = np.arange(len(start.bearing)), start.points
     options = replace(Options.preset_named("geometry"), lens=lens)
     first = None if first_std is None else (wrong, first_std)
-    return polish(images, points, wrong, options, first_focal=first, solved_lens=solved_lens)
+    return polish(Shot.of(images, points, wrong, first_focal=first, solved_lens=solved_lens), options)
 
 
 def seen_through(problem, shape):
@@ -147,7 +148,7 @@ def test_the_lenses_of_several_cameras_are_found():
     images = mapped_images(problem, start, guess=guess[groups])
     options = replace(Options.preset_named("geometry"), lens="focal")
     points = np.arange(len(start.bearing)), start.points
-    result = polish(images, points, guess * problem.focal, options, groups=groups)
+    result = polish(Shot.of(images, points, guess * problem.focal, groups=groups), options)
     assert result.lens.determined
     error = np.log(result.lens.lens.focal / problem.focal)
     assert 3e-4 < np.abs(error).max() < 2e-3

@@ -16,6 +16,7 @@ from factorsfm.lens.lens import Lens, through
 from factorsfm.lens.rolling_shutter import Recording, Shutter, seen_at_once, with_sweep
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.polish.polish import polish
+from factorsfm.polish.shot import Shot
 from factorsfm.report.result_folder import write_folder
 from factorsfm.result.assembly import _rolling_shutter
 from factorsfm.result.notes import shutter_note
@@ -64,7 +65,7 @@ def polished(problem, *, shutter="rolling", lens="fixed", guess=1.0, **options):
     known = replace(known, polish=replace(known.polish, **options))
     points = np.arange(len(start.bearing)), start.points
     recording = Recording(WIDTH, HEIGHT, np.arange(len(images)))
-    return polish(images, points, focal, known, recording=recording if shutter != "global" else None)
+    return polish(Shot.of(images, points, focal, recording=recording if shutter != "global" else None), known)
 
 
 def wrong_by(found, problem):
@@ -249,10 +250,9 @@ def test_a_camera_that_turns_does_not_seem_to_move(lens, guess, focals):
     ("readout", "order"), [([0.0, 0.9], "top to bottom"), ([0.0, -0.9], "bottom to top"), ([0.4, 0.0], "left to right")]
 )
 def test_the_note_says_how_images_are_read(readout, order):
-    found = handheld_polished("rolling").shutter
-    shutter = replace(found, lens=Lens(found.lens.focal, np.r_[np.zeros(4), readout]), std=0.021)
-
-    said = _rolling_shutter(shutter, recorded=True, error=0.1)
+    found = handheld_polished("rolling")
+    shutter = replace(found.shutter, lens=Lens(found.shutter.lens.focal, np.r_[np.zeros(4), readout]), std=0.021)
+    said = _rolling_shutter(replace(found, shutter=shutter))
     note = shutter_note(said, 1 / 25)
     assert f"from {order} in {abs(said.readout):.2f} ± 0.02" in note
     assert f"({40 * abs(said.readout):.1f} ms)" in note

@@ -8,6 +8,7 @@ import pytest
 from factorsfm import Options, Stream
 from factorsfm.lens.lens import through
 from factorsfm.polish.polish import polish
+from factorsfm.polish.shot import Shot
 from factorsfm.report.result_folder import write_folder
 from factorsfm.result.notes import _motion_notes, lens_note
 from factorsfm.result.reading import read_result
@@ -37,7 +38,7 @@ def polished(motion, zoom, *, parallax, guess=1.15, max_frames=400, noise_px=0.0
     points = np.arange(len(start.bearing)), start.points
     focal = guess * np.exp(problem.truth.log_focal)
     images = mapped_images(seen, start, guess=guess)
-    return problem, polish(images, points, focal, options, seconds=np.arange(len(images)) / 24)
+    return problem, polish(Shot.of(images, points, focal, seconds=np.arange(len(images)) / 24), options)
 
 
 @pytest.mark.parametrize(("motion", "parallax"), [("arc", 0.3), ("rotation", 0.0)])

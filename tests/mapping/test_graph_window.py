@@ -7,7 +7,7 @@ import pytest
 
 from factorsfm.graph.keyframe_graph import KeyframeGraph
 from factorsfm.mapping import graph_window
-from factorsfm.mapping.depth_fallback import DepthGuidance
+from factorsfm.mapping.depth_guidance import DepthGuidance
 from factorsfm.mapping.graph_window import choose_landmarks, measured_window, window_rows
 from factorsfm.mapping.landmarks import solve_alone
 from factorsfm.mapping.map_copy import MapCopy, MapUpdate

@@ -159,9 +159,9 @@ def test_a_wrong_prior_yields_to_wide_rays():
     np.testing.assert_allclose(result.inverse_distance, problem.truth.inverse_distance, rtol=0.0, atol=1e-4)
 
 
-def test_the_same_seed_gives_the_same_points():
+def test_it_gives_the_same_points_again():
     problem = make_problem("handheld", noise_px=1.0)
-    first, again = run(problem, seed=3), run(problem, seed=3)
+    first, again = run(problem), run(problem)
     np.testing.assert_array_equal(first.inverse_distance, again.inverse_distance)
 
 

@@ -7,6 +7,7 @@ import pytest
 
 from factorsfm.motion.stretches import Stretch
 from factorsfm.polish.polish import polish
+from factorsfm.polish.shot import Shot
 from factorsfm.result.notes import stretch_notes
 from factorsfm.support.options import Options
 from factorsfm.support.status import ShotKind
@@ -18,8 +19,8 @@ def polished(motion, parallax, noise_px=0.1, *, frames=72, rate=24.0):
     start = perturbed(problem.truth)
     points = np.arange(len(start.bearing)), start.points
     options = replace(Options.preset_named("geometry"), lens="fixed")
-    images = mapped_images(problem, start)
-    return problem, polish(images, points, np.array([problem.focal]), options, seconds=np.arange(frames) / rate)
+    shot = Shot.of(mapped_images(problem, start), points, np.array([problem.focal]), seconds=np.arange(frames) / rate)
+    return problem, polish(shot, options)
 
 
 @pytest.mark.parametrize("parallax", [0.1, 0.02])

@@ -107,7 +107,7 @@ def test_a_map_that_changes_its_mind_says_that_the_poses_before_are_void():
         frame = Frame(k, np.zeros((360, 640, 3), np.uint8), f"{k:06d}", None)
         image = mapper.add(tracks_at(k, *problem.of_frame(k)), lambda: None)
         updates.append(frame_update(frame, image, mapper, [], focal_changed=False))
-        assert not mapper.starts_anew  # the graph goes on, with the factors of an IMU and of the caller
+        assert not mapper.news.starts_anew  # the graph goes on, with the factors of an IMU and of the caller
     mapper.close()
     first = next(update for update in updates if update.starts_anew)
     assert first.index == 6

@@ -9,6 +9,7 @@ from factorsfm.adjustment.observations import Observations
 from factorsfm.polish import core_frames as module
 from factorsfm.polish.core_frames import core_frames
 from factorsfm.polish.polish import polish
+from factorsfm.polish.shot import Shot
 from factorsfm.support.options import Options
 from factorsfm.support.status import ShotKind
 from tests.estimation_problems import angles_between, make_problem, mapped_images
@@ -62,7 +63,9 @@ def polished(motion, lens, monkeypatch, few):
     guess, shape = (1.0, None) if lens == "fixed" else (1.1, np.zeros(4))  # of the focal length
     focal = np.array([problem.focal * guess])
     images = mapped_images(problem, problem.truth, guess=guess)
-    return problem.truth, polish(images, points, focal, options, shape=shape, seconds=np.arange(len(images)) / 24)
+    return problem.truth, polish(
+        Shot.of(images, points, focal, shape=shape, seconds=np.arange(len(images)) / 24), options
+    )
 
 
 @pytest.mark.parametrize("motion", ["truck", "rotation"])

@@ -7,6 +7,7 @@ import pytest
 
 from factorsfm.adjustment.observations import Observations
 from factorsfm.polish.polish import polish
+from factorsfm.polish.shot import Shot
 from factorsfm.support.errors import ReconstructionError
 from factorsfm.support.options import Options
 from tests.estimation_problems import Problem, make_problem, mapped_images, perturbed
@@ -80,7 +81,7 @@ def test_nothing_that_the_images_leave_open_makes_a_solve_fail(what, lens, guide
     points = np.arange(len(start.bearing)), start.points
     options = replace(Options.preset_named("default" if guided else "geometry"), lens=lens)
     try:
-        result = polish(images, points, focal, options, seconds=np.arange(len(images)) / 24)
+        result = polish(Shot.of(images, points, focal, seconds=np.arange(len(images)) / 24), options)
     except ReconstructionError:  # refused in a sentence
         return
     assert np.isfinite(result.state.rotation).all()

@@ -19,6 +19,7 @@ from factorsfm.polish.observability import (
     triangulation_angles,
 )
 from factorsfm.polish.polish import polish
+from factorsfm.polish.shot import Shot
 from factorsfm.result.notes import observability_notes
 from factorsfm.result.reconstruction import FrameResult
 from factorsfm.result.summary import failure_summary, pooled_observability
@@ -300,7 +301,7 @@ def polished(problem, **options):
     preset = Options.preset_named("geometry")
     preset = replace(preset, polish=replace(preset.polish, **options))
     points = np.arange(len(problem.points)), problem.points
-    return polish(mapped_images(problem, problem.truth), points, np.array([problem.focal]), preset)
+    return polish(Shot.of(mapped_images(problem, problem.truth), points, np.array([problem.focal])), preset)
 
 
 def test_the_polish_says_what_carries_each_camera():

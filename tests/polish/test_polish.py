@@ -13,6 +13,7 @@ from factorsfm.motion.readings import in_front
 from factorsfm.polish.camera_starts import best_solution
 from factorsfm.polish.connected_frames import connected_frames
 from factorsfm.polish.polish import polish
+from factorsfm.polish.shot import Shot
 from factorsfm.support.errors import ReconstructionError
 from factorsfm.support.options import Options
 from factorsfm.support.status import FrameStatus, ShotKind
@@ -40,7 +41,9 @@ def test_the_truth_is_found_from_a_damaged_map(motion, damage):
     problem = make_problem(motion, frames=12, points=200, parallax=0.05, noise_px=0.1)
     start = damage(problem.truth)
     points = np.arange(len(start.bearing)), start.points
-    result = polish(mapped_images(problem, start), points, np.array([problem.focal]), Options.preset_named("geometry"))
+    result = polish(
+        Shot.of(mapped_images(problem, start), points, np.array([problem.focal])), Options.preset_named("geometry")
+    )
     assert result.motion.kind is ShotKind.GENERAL
     state = in_unit_of(result.state, problem_truth := replace(
         problem.truth,
@@ -71,7 +74,7 @@ def test_a_long_shot_registers_the_frames_between_on_the_polished_points():
     options = Options.preset_named("geometry")
     options = replace(options, polish=replace(options.polish, max_frames=6))
     points = np.arange(len(problem.truth.bearing)), problem.truth.points
-    result = polish(mapped_images(problem, problem.truth), points, np.array([problem.focal]), options)
+    result = polish(Shot.of(mapped_images(problem, problem.truth), points, np.array([problem.focal])), options)
     assert result.frames == list(range(12))
     assert result.covariance.shape == (12, 6, 6)
     assert angles_between(result.state.rotation, problem.truth.rotation).max() < 7e-4
@@ -138,14 +141,16 @@ def test_frames_that_no_track_holds_are_left_out_and_change_nothing(motion, dark
     problem = make_problem(motion, frames=15, points=200, parallax=0.05, noise_px=0.1)
     points = np.arange(len(problem.truth.bearing)), problem.truth.points
     options, focal = Options.preset_named("geometry"), np.array([problem.focal])
-    result = polish(with_dark_frames(mapped_images(problem, problem.truth), dark, kept), points, focal, options)
+    result = polish(
+        Shot.of(with_dark_frames(mapped_images(problem, problem.truth), dark, kept), points, focal), options
+    )
     light = [k for k in range(15) if k not in dark]
     assert result.frames == light
     assert {k: why.split(" needed")[0] for k, why in result.left_out.items()} == dict.fromkeys(dark, f"{kept} of 15")
     only = mapped_images(problem, problem.truth)
     for k in dark:
         only[k].forget(FrameStatus.BLANK, "")
-    alone = polish(only, points, focal, options)
+    alone = polish(Shot.of(only, points, focal), options)
     assert not alone.left_out
     np.testing.assert_allclose(result.state.rotation, alone.state.rotation, atol=1e-6)
     np.testing.assert_allclose(result.state.translation, alone.state.translation, atol=1e-6)
@@ -159,7 +164,7 @@ def test_a_weak_first_camera_is_the_world_but_does_not_spoil_the_others():
     problem = make_problem("truck", frames=15, points=200, parallax=0.05, noise_px=0.1)
     images = with_dark_frames(mapped_images(problem, problem.truth), [0], kept=16)
     points = np.arange(len(problem.truth.bearing)), problem.truth.points
-    result = polish(images, points, np.array([problem.focal]), Options.preset_named("geometry"))
+    result = polish(Shot.of(images, points, np.array([problem.focal])), Options.preset_named("geometry"))
     assert result.frames == list(range(15))
     np.testing.assert_allclose(result.state.rotation[0], np.eye(3), atol=1e-12)
     np.testing.assert_allclose(result.state.translation[0], 0.0, atol=1e-12)
@@ -178,7 +183,7 @@ def test_without_tracks_that_join_frames_there_is_no_result():
         image.tracks = replace(image.tracks, ids=image.tracks.ids + 1000 * k)
     points = np.arange(len(problem.truth.bearing)), problem.truth.points
     with pytest.raises(ReconstructionError, match="0 of 6 frames have enough tracks that agree"):
-        polish(images, points, np.array([problem.focal]), Options.preset_named("geometry"))
+        polish(Shot.of(images, points, np.array([problem.focal])), Options.preset_named("geometry"))
 
 
 def test_the_larger_part_of_what_falls_apart_is_kept():
@@ -201,7 +206,7 @@ def test_frames_between_do_not_translate_where_the_others_do_not(motion):
     options = Options.preset_named("geometry")
     options = replace(options, polish=replace(options.polish, max_frames=6))
     points = np.arange(len(problem.truth.bearing)), problem.truth.points
-    result = polish(mapped_images(problem, problem.truth), points, np.array([problem.focal]), options)
+    result = polish(Shot.of(mapped_images(problem, problem.truth), points, np.array([problem.focal])), options)
     assert result.motion.kind == motion
     assert len(result.frames) == 24
     assert not result.state.translation.any()

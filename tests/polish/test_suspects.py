@@ -3,6 +3,7 @@
 import numpy as np
 
 from factorsfm.polish.polish import polish
+from factorsfm.polish.shot import Shot
 from factorsfm.support.options import Options
 from tests.estimation_problems import make_problem, mapped_images
 from tests.motion.test_moving import WALKER, path_error, with_walker
@@ -13,7 +14,7 @@ GEOMETRY = Options.preset_named("geometry")
 def polished(problem, suspects=None):
     points = np.arange(len(problem.points)), problem.truth.points
     images = mapped_images(problem, problem.truth)
-    return polish(images, points, np.array([problem.focal]), GEOMETRY, suspects=suspects)
+    return polish(Shot.of(images, points, np.array([problem.focal]), suspects=suspects), GEOMETRY)
 
 
 def test_a_statue_comes_back_and_hardly_anything_is_lost():

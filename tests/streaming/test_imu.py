@@ -24,6 +24,7 @@ from factorsfm import (
     reconstruct,
 )
 from factorsfm.inertial.fit import ImuFit
+from factorsfm.mapping.map_news import MapNews
 from factorsfm.streaming import imu_source
 from factorsfm.streaming.imu_result import _note
 from factorsfm.streaming.imu_source import ImuSource
@@ -246,7 +247,7 @@ def test_attempts_that_fail_become_rarer(monkeypatch):
 
     monkeypatch.setattr(imu_source, "fit_timing", fails)
     source = ImuSource(recording())
-    mapper = SimpleNamespace(starts_anew=False, keyframes=[], images=[], refines_focal=False, started=True)
+    mapper = SimpleNamespace(news=MapNews(), keyframes=[], images=[], refines_focal=False, started=True)
     for k in range(1200):
         mapper.keyframes.append(k)
         source.follow(mapper, k / 2)
