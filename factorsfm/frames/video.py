@@ -29,6 +29,7 @@ from factorsfm.frames.fields import CombWatch, Fields, FieldSplitter, blended, i
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.picture import Orientation, Picture
 from factorsfm.frames.video_damage import NoiseWatch, Numbers, warn_if_short
+from factorsfm.frames.views import check_is_one_view
 from factorsfm.support.errors import InputError
 
 logger = logging.getLogger(__name__)
@@ -74,7 +75,7 @@ def open_video(path: Path) -> VideoFile:
     """Decode the first frames of a file.
 
     Raises:
-        InputError: the file is not a video, or cannot be decoded.
+        InputError: the file is not a video, cannot be decoded, or shows a sphere or two views.
     """
     with opened_video(path) as (container, stream):
         several = len(video_streams(container))
@@ -85,6 +86,7 @@ def open_video(path: Path) -> VideoFile:
         first = next(frames, None)
         if first is None:
             raise InputError(f"{path} cannot be decoded as a video; {problem(path, stream)}")
+        check_is_one_view(first, path)
         second = next(frames, None)
         timed = first.time is not None and second is not None and (second.time or 0.0) > first.time
         orientation = Orientation.of(first)

@@ -24,6 +24,7 @@ from tests.video_files import (
     PQ,
     QUIET_H265,
     interlaced,
+    marked_as_sphere,
     moving_texture,
     woven,
     write_video,
@@ -183,6 +184,23 @@ def test_a_hole_in_a_stream_leaves_numbers_free_and_corrupt_frames_out(tmp_path,
     assert f"frames that cannot be read: {len(missing)} ({missing[0]}, " in caplog.text
     late = list(read_frames(path, slice(120, None)))
     assert [frame.index for frame in late] == list(range(120, 130))
+
+
+@pytest.mark.parametrize(
+    ("stereo", "said"),
+    [("left_right", "side by side"), ("bottom_top", "one above the other"), ("col_interleaved_lr", "in columns")],
+)
+def test_two_views_in_a_frame_are_refused_and_one_is_read(tmp_path, stereo, said):
+    with pytest.raises(InputError, match=rf"shot\.mkv holds two views in each frame \({said}\); cut one of them out"):
+        read_frames(write_video(tmp_path / "shot.mkv", moving_texture(3), stereo=stereo))
+    assert len(list(read_frames(write_video(tmp_path / "shot.mkv", moving_texture(3), stereo="mono")))) == 3
+
+
+def test_a_video_of_a_sphere_is_refused(tmp_path):
+    path = write_video(tmp_path / "shot.mp4", moving_texture(3))
+    assert len(list(read_frames(path))) == 3
+    with pytest.raises(InputError, match=r"shot\.mp4 is a 360 degree video \(equirectangular\), .*make a flat view"):
+        read_frames(marked_as_sphere(path))
 
 
 def test_damage_that_a_decoder_does_not_report_is_seen_in_the_images(tmp_path, caplog):
