@@ -19,10 +19,11 @@ _MOVED_PX = 0.1
 # Share of the texture that changes in some of the new frames around, if one that changes by so little repeats. Where
 # hardly anything moves, encoders at low rates leave most blocks of a frame as they were, and all of them now and then,
 # mostly after a keyframe. Such a frame is new, and as evidence it costs nothing. In renders that move by a tenth of a
-# pixel a frame 0.1 to 0.6 changes then with H.264, and up to 0.9 with MPEG-4, MPEG-2 and VP9 at their lowest rates;
-# where frames do repeat, and move by as little, 0.7 or more.
-_CHANGED, _SOME_PERCENTILE = 0.7, 66.0  # of the new frames: repeats that were missed are among them
+# pixel a frame less than 0.6 changes then with H.264, up to 0.9 with MPEG-4, MPEG-2 and VP9 at their lowest rates;
+# where frames do repeat, and move by as little, 0.6 or more.
+_CHANGED, _SOME_PERCENTILE = 0.6, 66.0  # of the new frames: repeats that were missed are among them
 _BLOCK_PX = 16  # as most codecs leave them
+_FINE = 16  # steps of a grey level in the texture of a block, which ends at 16 levels: dark images count as well
 _AROUND, _LEAST_AROUND = 8, 2  # new frames that a difference is compared with
 _MOST_IN_A_ROW = 3  # animation on fours; a camera that stands for longer is no cadence
 _COMPARED_PIXELS = 500_000  # of whole rows: enough for a mean
@@ -66,7 +67,13 @@ class RepeatDetector:
 
 def _share_changed(change: NDArray[np.uint8], texture: NDArray[np.uint8], block_rows: int) -> float:
     """Share of the texture that lies in blocks with any change; `block_rows`: rows of a block."""
-    blocks = max(1, texture.shape[1] // _BLOCK_PX), max(1, texture.shape[0] // block_rows)
-    changed = cv2.resize(cv2.threshold(change, 0, 255, cv2.THRESH_BINARY)[1], blocks, interpolation=cv2.INTER_AREA) > 0
-    weight = cv2.resize(texture.astype(np.float32), blocks, interpolation=cv2.INTER_AREA)
-    return float(weight[changed].sum() / max(weight.sum(), 1e-9))
+    width, height = max(1, texture.shape[1] // _BLOCK_PX), max(1, texture.shape[0] // block_rows)
+    whole = (slice(height * block_rows), slice(width * _BLOCK_PX))  # to take the mean of whole blocks is fast
+    changed, weight = (
+        cv2.resize(pixels[whole], (width, height), interpolation=cv2.INTER_AREA)
+        for pixels in (
+            cv2.threshold(change, 0, 255, cv2.THRESH_BINARY)[1],
+            cv2.convertScaleAbs(texture, alpha=_FINE),
+        )
+    )
+    return float(weight[changed > 0].sum(dtype=np.float64) / max(weight.sum(dtype=np.float64), 1.0))
