@@ -20,7 +20,7 @@ from factorsfm.frames.edits import read_edit
 from factorsfm.frames.reading import read_frames
 from factorsfm.frames.repeats import RepeatDetector
 from factorsfm.support.errors import FactorsfmError
-from tests.video_files import FORMATS, HLG, PQ, interlaced, moving_texture, write_video
+from tests.video_files import FORMATS, HLG, PQ, interlaced, marked_as_sphere, moving_texture, write_video
 
 DOCS = Path(__file__).parents[1] / "docs" / "footage.md"
 BEGIN, END = "<!-- made by tests/footage_table.py -->\n", "<!-- end -->\n"
@@ -144,6 +144,8 @@ INPUTS: list[tuple[str, Make]] = [
     ("sequence with a link to nothing", link_to_nothing),
     ("images of two sizes", of_two_sizes),
     ("folder without images", lambda path: path.mkdir() or path),
+    ("360 degree video", lambda path: marked_as_sphere(write_video(path.with_suffix(".mp4"), moving_texture(COUNT)))),
+    ("stereo video, views side by side", video(stereo="left_right")),
     ("codec without decoder", without_decoder),
     ("MP4 that is still being written", bytes_in(struct.pack(">I", 32) + b"ftypisom" + bytes(2000), ".mp4")),
     ("empty file", bytes_in(b"", ".mp4")),

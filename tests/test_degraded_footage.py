@@ -16,6 +16,7 @@ from factorsfm.evaluation.degrade import degraded_frames
 from factorsfm.evaluation.metrics import TrajectoryErrors, trajectory_errors
 from factorsfm.support.similarity import pose_arrays
 from factorsfm.synthetic import Motion, RenderedShot, render_shot, simulate_prior
+from tests.video_files import write_video
 
 SIZE = (480, 270)
 
@@ -82,6 +83,23 @@ def test_a_video(
     assert polished[0] < np.median(errors.ate) < polished[1]
     assert turned[0] < np.median(errors.r_rpe) < turned[1]  # degrees
     assert depth[0] < depths_within(result, shot, order, 0.02) < depth[1]
+
+
+def test_a_stream_that_lost_packets(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Decoders fill up what is missing from the frames before, and mark only some of these frames."""
+    shot = render_shot("truck", 36, 320, 180, 0.08)
+    path = write_video(tmp_path / "shot.ts", shot.images, options={"crf": "20", "g": "12"}, rate=24)
+    data, lost = path.read_bytes(), np.random.default_rng(3)
+    packets = [data[k : k + 188] for k in range(0, len(data), 188)]
+    path.write_bytes(b"".join(p for k, p in enumerate(packets) if k < len(packets) // 5 or lost.random() > 0.01))
+    result = factorsfm.reconstruct(path, camera=shot.camera, depth=None)
+    (said,) = {message for message in caplog.messages if "damaged" in message}
+    assert "frames that cannot be read" in said
+    order = np.array([frame.index for frame in result.registered])
+    assert 28 <= len(order) < 36
+    errors = errors_of([frame.cam_from_world for frame in result.registered], shot, order)
+    assert 0.005 < np.median(errors.ate) < 0.03  # 0.0015 without losses
+    assert errors.ate.max() < 0.08
 
 
 def test_a_set(tmp_path: Path) -> None:

@@ -81,6 +81,7 @@ def write_video(
     rotation: int = 0,
     mirrored: bool = False,
     field_order: str | None = None,
+    stereo: str | None = None,
     **tags: int,
 ) -> Path:
     """Write images, uint8 BGR or uint16 RGB, as a video; the path, for convenience.
@@ -89,12 +90,15 @@ def write_video(
         times: of the frames, in hundredths of a second; aspect: of a pixel.
         rotation: degrees against the clock; mirrored: from side to side after it.
         field_order: "tff" or "bff" marks the frames as interlaced.
+        stereo: how two views lie in a frame, as Matroska names it.
         tags: `colorspace`, `color_range`, `color_trc` of the frames.
     """
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=rate, options=options or {})
         height, width = images[0].shape[:2]
         stream.width, stream.height, stream.pix_fmt, stream.bit_rate = width, height, pixels, 8_000_000
+        if stereo is not None:
+            stream.metadata["stereo_mode"] = stereo
         if aspect is not None:
             stream.codec_context.sample_aspect_ratio = aspect
         if times is not None:
@@ -121,6 +125,25 @@ def write_video(
                 frame = graph.pull()
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
+    return path
+
+
+def marked_as_sphere(path: Path) -> Path:
+    """The same MP4 file with the box that cameras for 360 degrees write into its only track."""
+    name = "http://ns.google.com/videos/1.0/spherical/"
+    stated = {"Spherical": "true", "Stitched": "true", "ProjectionType": "equirectangular", "StitchingSoftware": "test"}
+    tags = "".join(f"<GSpherical:{key}>{value}</GSpherical:{key}>" for key, value in stated.items())
+    text = f'<?xml version="1.0"?><rdf:SphericalVideo xmlns:GSpherical="{name}">{tags}</rdf:SphericalVideo>'.encode()
+    content = b"uuid" + bytes.fromhex("ffcc8263f8554a938814587a02521fdd") + text
+    box = (len(content) + 4).to_bytes(4, "big") + content
+    data = bytearray(path.read_bytes())
+    movie = data.rfind(b"moov") - 4  # behind the frames, whose places do not change
+    track = data.find(b"trak", movie) - 4
+    end = track + int.from_bytes(data[track : track + 4], "big")
+    data[end:end] = box
+    for begin in (movie, track):
+        data[begin : begin + 4] = (int.from_bytes(data[begin : begin + 4], "big") + len(box)).to_bytes(4, "big")
+    path.write_bytes(data)
     return path
 
 

@@ -18,7 +18,8 @@ _PACED = 25  # frames, the last of which tell the rate of a source
 # Frames a second: slower sources are photographs one after another, of which as many are needed as of a video.
 _SLOWEST, _FASTEST = 12.0, 240.0
 
-_LONGEST_PERIOD = 12  # frames: telecine has 5, animation 4 at most
+_LONGEST_PERIOD = 12  # frames: 25 in 60 frames a second; telecine has 5, animation 4 at most
+_LONGEST_OF_ONE = 6  # with a single repeat: 25 in 30; more lie between keyframes, after which encoders skip frames
 # What a cadence has to explain of the repeats, or all but one: the first repeat of a shot is missed.
 _REGULAR, _LEAST_REPEATS = 0.9, 3
 
@@ -93,6 +94,9 @@ def cadence(repeated: Sequence[bool]) -> tuple[int, int] | None:
         pattern = np.array([flags[phase::period].mean() > 0.5 for phase in range(period)])
         expected = np.resize(pattern, len(flags))
         matched, either = int((expected & flags).sum()), int((expected | flags).sum())
+        new = int((~pattern).sum())
+        if new == period - 1 and period > _LONGEST_OF_ONE:
+            continue
         if matched >= max(min(_REGULAR * either, either - 1), _LEAST_REPEATS):
-            return period, int((~pattern).sum())
+            return period, new
     return None

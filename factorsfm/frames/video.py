@@ -28,7 +28,8 @@ from factorsfm.frames.container import (
 from factorsfm.frames.fields import CombWatch, Fields, FieldSplitter, blended, is_top_first, show_one_moment
 from factorsfm.frames.frame import Frame
 from factorsfm.frames.picture import Orientation, Picture
-from factorsfm.frames.video_damage import Numbers, warn_if_short
+from factorsfm.frames.video_damage import NoiseWatch, Numbers, warn_if_short
+from factorsfm.frames.views import check_is_one_view
 from factorsfm.support.errors import InputError
 
 logger = logging.getLogger(__name__)
@@ -74,7 +75,7 @@ def open_video(path: Path) -> VideoFile:
     """Decode the first frames of a file.
 
     Raises:
-        InputError: the file is not a video, or cannot be decoded.
+        InputError: the file is not a video, cannot be decoded, or shows a sphere or two views.
     """
     with opened_video(path) as (container, stream):
         several = len(video_streams(container))
@@ -85,6 +86,7 @@ def open_video(path: Path) -> VideoFile:
         first = next(frames, None)
         if first is None:
             raise InputError(f"{path} cannot be decoded as a video; {problem(path, stream)}")
+        check_is_one_view(first, path)
         second = next(frames, None)
         timed = first.time is not None and second is not None and (second.time or 0.0) > first.time
         orientation = Orientation.of(first)
@@ -131,7 +133,7 @@ def decode(video: VideoFile, selection: slice, fields: Fields = "auto") -> Itera
     convert = _Converter(video, fields, FieldSplitter(video.top_first) if apart else None)
     watch = CombWatch() if fields == "auto" and not (video.interlaced or video.film) else None
     size = video.path.stat().st_size
-    numbers = Numbers(video.interval)
+    numbers, noise = Numbers(video.interval), NoiseWatch()
     position, frame = -1, None
     for position, frame in numbers.of(*_from(video, chosen.first_frame)):
         if chosen.is_over(position):
@@ -141,6 +143,7 @@ def decode(video: VideoFile, selection: slice, fields: Fields = "auto") -> Itera
                 f"{video.path} is interlaced before frame {position}, but not at its beginning; "
                 "fields apart or blend (--fields) is expected for such a video"
             )
+        noise.push(position, frame)
         wanted = chosen.of_frame(position)
         if wanted:
             yield from convert(frame, wanted)
@@ -150,6 +153,7 @@ def decode(video: VideoFile, selection: slice, fields: Fields = "auto") -> Itera
             end = (frame.time or 0.0) - (video.start or 0.0) + video.interval
             warn_if_short(video.path, (position + 1, video.announced), (end, video.announced_seconds))
     numbers.warn(video.path)
+    noise.warn(video.path)
 
 
 def _are_taken_apart(video: VideoFile, fields: Fields) -> bool:

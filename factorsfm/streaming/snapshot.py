@@ -29,7 +29,7 @@ from factorsfm.support.output_files import replaced_file
 from factorsfm.support.status import FrameStatus
 from factorsfm.tracks.image_tracks import ImageTracks
 
-_MAGIC, _ANY_MAGIC = b"factorsfm-2\n", b"factorsfm-"
+_MAGIC, _ANY_MAGIC = b"factorsfm-3\n", b"factorsfm-"
 _CHECKSUM_BYTES = 32
 _DTYPES = {"bool", "uint8", "int32", "int64", "uint64", "float32", "float64"}
 _TYPES: dict[str, Any] = {
@@ -87,8 +87,10 @@ def read_snapshot(path: Path) -> dict[str, Any]:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"snapshot {path} cannot be read: {error.strerror}") from error
+    if not data.startswith(_ANY_MAGIC):
+        raise InputError(f"{path} is not a snapshot of a stream")
     if not data.startswith(_MAGIC):
-        raise InputError(f"{path} is not a snapshot of this version")
+        raise InputError(f"snapshot {path} is of another version of factorsfm; read it with that one, or begin anew")
     body, checksum = data[:-_CHECKSUM_BYTES], data[-_CHECKSUM_BYTES:]
     if hashlib.sha256(body).digest() != checksum:
         raise InputError(f"snapshot {path} is torn: its checksum is wrong")

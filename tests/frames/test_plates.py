@@ -151,6 +151,34 @@ def test_linear_dpx_goes_through_the_tone_curve(tmp_path):
     assert np.unique(read_image(tmp_path / "a.dpx")).tolist() == [95]
 
 
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        *[("a.dpx", {"oiio:BitsPerSample": bits}) for bits in (10, 16)],
+        *[("a.exr", {"compression": how}) for how in ("none", "piz", "b44")],
+        *[("a.tif", {"compression": how}) for how in ("none", "packbits")],
+        ("a.bmp", {}),
+    ],
+)
+def test_what_ends_early_is_refused_also_where_nothing_is_compressed(tmp_path, name, options, capfd):
+    oiio = pytest.importorskip("OpenImageIO")
+    path = tmp_path / name
+    spec = oiio.ImageSpec(WIDTH, HEIGHT, 3, {".dpx": "uint16", ".exr": "half"}.get(path.suffix, "uint8"))
+    for key, value in options.items():
+        spec.attribute(key, value)
+    out = oiio.ImageOutput.create(str(path))
+    assert out.open(str(path), spec)
+    out.write_image(colors(np.uint16, 65535))
+    out.close()
+    assert read_image(path).std() > 20
+    data = path.read_bytes()
+    for kept in (len(data) // 2, len(data) - 5000, len(data) - 40):
+        path.write_bytes(data[:kept])
+        with pytest.raises(InputError, match=rf"image .*{name} cannot be decoded.*(damaged|truncated)"):
+            read_image(path)
+    assert capfd.readouterr() == ("", "")
+
+
 @pytest.mark.parametrize("suffix", [".png", ".tif"])
 def test_sixteen_bits_are_kept_and_tracked_rounded(tmp_path, suffix):
     deep = colors(np.uint16, 65535)

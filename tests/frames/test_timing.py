@@ -1,12 +1,15 @@
 """Times of frames, and the rhythm of those that repeat."""
 
+import cv2
 import numpy as np
 import pytest
 
+from factorsfm.frames.reading import read_frames
 from factorsfm.frames.repeats import RepeatDetector
 from factorsfm.frames.timing import Pace, are_uneven, cadence, frame_interval, frame_times
 from factorsfm.support.pace import frames_in
-from tests.video_files import moving_texture
+from factorsfm.synthetic import render_shot
+from tests.video_files import moving_texture, write_video
 
 
 def test_even_times_are_the_indices_though_containers_round_them():
@@ -33,7 +36,10 @@ def test_times_that_are_unknown_or_do_not_rise_are_no_times(stamps):
 
 @pytest.mark.parametrize(
     ("pattern", "period", "new"),
-    [("nnnnr", 5, 4), ("nr", 2, 1), ("nnr", 3, 2), ("nrnrr", 5, 2), ("nrr", 3, 1)],
+    [
+        *[("nnnnr", 5, 4), ("nr", 2, 1), ("nnr", 3, 2), ("nrnrr", 5, 2), ("nrr", 3, 1)],
+        *[("nnnnnr", 6, 5), ("nrnrnrrnrnrr", 12, 5)],
+    ],
 )
 def test_a_cadence_is_found_though_a_repeat_is_missed(pattern, period, new):
     flags = np.resize(np.array([c == "r" for c in pattern]), 60)
@@ -47,6 +53,12 @@ def test_dropped_frames_have_no_cadence():
     flags[[7, 20, 22, 51, 83]] = True
     assert cadence(flags.tolist()) is None
     assert cadence([False] * 50) is None
+
+
+@pytest.mark.parametrize("keyframes", [8, 12])
+def test_one_frame_from_keyframe_to_keyframe_is_no_cadence(keyframes):
+    assert cadence([k % keyframes == 1 for k in range(100)]) is None
+    assert cadence([k % keyframes in (1, 2) for k in range(100)]) == (keyframes, keyframes - 2)
 
 
 def grainy(images):
@@ -66,6 +78,22 @@ def test_repeats_are_told_from_new_frames(step):
         found.append(detector.push(np.clip(compressed, 0, 255).astype(np.uint8) if step > 1 else images[number]))
     expected = [k > 0 and shown[k] == shown[k - 1] for k in range(len(shown))]
     assert found == expected
+
+
+def test_frames_that_an_encoder_skips_repeat_none(tmp_path):
+    """A dolly of a tenth of a pixel a frame, at a rate for which keyframes are dear; then with true repeats."""
+    images = render_shot("dolly", 48, 320, 180, parallax=0.03).images
+
+    def repeats(name, numbers, **options):
+        video = write_video(tmp_path / name, [images[k] for k in numbers], options=options)
+        detector = RepeatDetector()
+        greys = [cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY) for frame in read_frames(video)]
+        assert len(greys) == len(numbers)
+        return [detector.push(grey) for grey in greys]
+
+    assert not any(repeats("skips.mp4", range(48), b="60000", g="12"))
+    shown = [k for k in range(48) for _ in range(2 if k % 4 == 3 else 1)]
+    assert cadence(repeats("repeats.mp4", shown, crf="18")) == (5, 4)
 
 
 def test_images_that_all_are_the_same_repeat_none():

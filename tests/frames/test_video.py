@@ -1,5 +1,6 @@
 """Video files as they come: codecs, containers, times, fields, pixel aspect, orientation and colour."""
 
+import re
 from fractions import Fraction
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from av.stream import Disposition
 from factorsfm.frames.ranges import parse_range
 from factorsfm.frames.reading import read_frames
 from factorsfm.support.errors import InputError
+from factorsfm.synthetic import render_shot
 from tests.video_files import (
     BT709,
     BT2020,
@@ -20,7 +22,9 @@ from tests.video_files import (
     HLG,
     LIMITED,
     PQ,
+    QUIET_H265,
     interlaced,
+    marked_as_sphere,
     moving_texture,
     woven,
     write_video,
@@ -180,6 +184,44 @@ def test_a_hole_in_a_stream_leaves_numbers_free_and_corrupt_frames_out(tmp_path,
     assert f"frames that cannot be read: {len(missing)} ({missing[0]}, " in caplog.text
     late = list(read_frames(path, slice(120, None)))
     assert [frame.index for frame in late] == list(range(120, 130))
+
+
+@pytest.mark.parametrize(
+    ("stereo", "said"),
+    [("left_right", "side by side"), ("bottom_top", "one above the other"), ("col_interleaved_lr", "in columns")],
+)
+def test_two_views_in_a_frame_are_refused_and_one_is_read(tmp_path, stereo, said):
+    with pytest.raises(InputError, match=rf"shot\.mkv holds two views in each frame \({said}\); cut one of them out"):
+        read_frames(write_video(tmp_path / "shot.mkv", moving_texture(3), stereo=stereo))
+    assert len(list(read_frames(write_video(tmp_path / "shot.mkv", moving_texture(3), stereo="mono")))) == 3
+
+
+def test_a_video_of_a_sphere_is_refused(tmp_path):
+    path = write_video(tmp_path / "shot.mp4", moving_texture(3))
+    assert len(list(read_frames(path))) == 3
+    with pytest.raises(InputError, match=r"shot\.mp4 is a 360 degree video \(equirectangular\), .*make a flat view"):
+        read_frames(marked_as_sphere(path))
+
+
+def test_damage_that_a_decoder_does_not_report_is_seen_in_the_images(tmp_path, caplog):
+    """H.265 decodes blocks of noise from zeros, and says nothing; noise that was filmed is no damage."""
+    images = render_shot("truck", 30, 320, 180, parallax=0.06).images
+    path = write_video(tmp_path / "shot.mkv", images, "libx265", options=QUIET_H265)
+    whole = path.read_bytes()
+    assert len(list(read_frames(path))) == 30
+    noise = np.random.default_rng(0).integers(0, 255, (10, 180, 320, 3), dtype=np.uint8)
+    assert len(list(read_frames(write_video(tmp_path / "noise.mp4", noise)))) == 10
+    assert caplog.messages == []
+    begin, end = len(whole) // 4, len(whole) * 9 // 10
+    damaged = bytearray(whole)
+    for hole in range(begin, end, (end - begin) // 8):
+        damaged[hole : hole + 100] = bytes(100)
+    path.write_bytes(damaged)
+    assert len(list(read_frames(path))) == 30
+    (said,) = caplog.messages
+    found = re.search(r"shot\.mkv may be damaged: (\d+) frames \(.*\) have many times the edges of the keyframe", said)
+    assert found is not None
+    assert 5 <= int(found[1]) <= 25
 
 
 def test_uneven_frames_are_counted_one_by_one_beside_damage(tmp_path):

@@ -22,7 +22,7 @@ from tests.rendered import Maps, with_fewer_tracks
 
 FRAMES = 14
 FOREIGN = range(9, 12)  # frames of another room: the view is lost and found again
-MAGIC = b"factorsfm-2\n"
+MAGIC = b"factorsfm-3\n"
 
 
 @cache
@@ -197,6 +197,15 @@ def test_whatever_is_no_snapshot_is_refused_and_runs_nothing(tmp_path, monkeypat
     with pytest.raises(InputError, match=reason):
         Stream.load("state")
     assert [path.name for path in tmp_path.iterdir()] == ["state"]
+
+
+def test_a_snapshot_of_another_version_is_refused_as_such(tmp_path, good):
+    path = tmp_path / "state"
+    path.write_bytes(good.replace(MAGIC, b"factorsfm-2\n", 1))
+    with pytest.raises(InputError, match="of another version of factorsfm"):
+        Stream.load(path)
+    path.write_bytes(good)
+    Stream.load(path, depth=prior()).close()
 
 
 def test_parts_that_are_missing_or_foreign_are_refused(tmp_path, good):
