@@ -336,6 +336,17 @@ def test_named_points_are_nulls(solved: Path, tmp_path: Path) -> None:
     assert not prim.GetChildren()
 
 
+def test_a_scene_is_aligned_at_them(solved: Path, tmp_path: Path) -> None:
+    picks = ["--origin", NAMES[1], "--axis", NAMES[4], "--distance", NAMES[1], NAMES[4], "2"]
+    assert main(["align", str(solved), *picks, "--output", str(tmp_path / "aligned")]) == 0
+    places = {
+        p["name"]: p["position"] for p in json.loads((tmp_path / "aligned/summary.json").read_text())["named_points"]
+    }
+    np.testing.assert_allclose(places[NAMES[1]], 0, atol=1e-6)
+    assert np.linalg.norm(places[NAMES[4]]) == pytest.approx(2.0, abs=1e-6)
+    assert places[NAMES[4]][2] == pytest.approx(0.0, abs=1e-6)
+
+
 def test_they_are_left_out_by_their_names_and_numbers(solved: Path, tmp_path: Path) -> None:
     number = next(
         p["track"] for p in json.loads((solved / "summary.json").read_text())["named_points"] if p["name"] == "slips"
