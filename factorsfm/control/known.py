@@ -89,7 +89,7 @@ class MarkedPoint:
     Attributes:
         name: by which distances and heights refer to it.
         pixels: where frames see it, pixels of the image with centres at integers; one frame at least, two where the
-            position is unknown.
+            position is unknown. None: where the track of the user with this name is.
         pixel_sigma: of each coordinate of a mark, pixels.
         position: (3,) or None; sigma: of each coordinate.
 
@@ -98,22 +98,27 @@ class MarkedPoint:
     """
 
     name: str
-    pixels: Mapping[FrameKey, Vector]
+    pixels: Mapping[FrameKey, Vector] | None = None
     pixel_sigma: float = 1.0
     position: Vector | None = None
     sigma: float | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.pixels, Mapping):
+        if self.pixels is not None and not isinstance(self.pixels, Mapping):
             raise InputError(f'"pixels" is {self.pixels!r}; frames with their [x, y] are expected')
         needed = 1 if self.position is not None else 2
-        if len(self.pixels) < needed:
+        if self.pixels is not None and len(self.pixels) < needed:
             raise InputError(f'"{self.name}" is marked in {len(self.pixels)} of {needed} needed frames')
-        for frame, xy in self.pixels.items():
+        for frame, xy in self.marks.items():
             _check_vector(f"pixels of {frame}", xy, 2)
         _check_vector("position", self.position, 3)
         _check_sigma("pixel_sigma", self.pixel_sigma, True)
         _check_sigma("sigma", self.sigma, self.position is not None)
+
+    @property
+    def marks(self) -> Mapping[FrameKey, Vector]:
+        """The pixels, as far as they are given."""
+        return self.pixels or {}
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,7 +210,9 @@ class Control:
     def _check_enough(self) -> None:
         """As far as that can be said without the images."""
         known = [(pose.position, pose.sigma) for pose in self.poses]
-        known += [(point.position, point.sigma) for point in self.points if len(point.pixels) > 1]
+        known += [
+            (point.position, point.sigma) for point in self.points if point.pixels is None or len(point.pixels) > 1
+        ]
         given = [(position, sigma) for position, sigma in known if position is not None]
         check_enough(
             np.array([position for position, _ in given], np.float64).reshape(-1, 3),
@@ -235,7 +242,7 @@ class Control:
     @property
     def frames(self) -> list[FrameKey]:
         """All frames that are referred to, each once."""
-        marked = [frame for point in self.points for frame in point.pixels]
+        marked = [frame for point in self.points for frame in point.marks]
         ends = [frame for distance in self.distances for frame in distance.frames]
         every = [*marked, *ends, *(height.frame for height in self.heights), *(pose.frame for pose in self.poses)]
         return list(dict.fromkeys(every))
@@ -288,7 +295,7 @@ def find_frames(control: Control, frames: Sequence[tuple[int, str]]) -> dict[Fra
     if missing:
         raise InputError(f"control: there is no frame {missing[0]!r} among the {len(frames)} frames")
     _check_different([pose.frame for pose in control.poses], found)
-    for keys in (*(point.pixels for point in control.points), *(distance.frames for distance in control.distances)):
+    for keys in (*(point.marks for point in control.points), *(distance.frames for distance in control.distances)):
         _check_different(keys, found)
     return {key: found[key] for key in control.frames}
 
@@ -338,12 +345,14 @@ def locate(
         in_camera: gives the camera of the frame at a position, and what pixels (n, 2) of the frame are in it.
 
     Raises:
-        InputError: a frame is not there, or a mark is where the lens has no inverse.
+        InputError: a frame is not there, a mark is where the lens has no inverse, or a point has none.
     """
+    if bare := [point.name for point in control.points if point.pixels is None]:
+        raise InputError(f'control: point {bare[0]} has no "pixels", and no track of this name is given (--tracks)')
     found = find_frames(control, [(frame.index, frame.name) for frame in frames])
     marked: dict[int, list[tuple[int, FrameKey, Vector]]] = defaultdict(list)
     for row, point in enumerate(control.points):
-        for key, xy in point.pixels.items():
+        for key, xy in point.marks.items():
             marked[found[key]].append((row, key, xy))
     marks = []
     for position, seen in sorted(marked.items()):
