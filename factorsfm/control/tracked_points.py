@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 from factorsfm.control.known import Control, FrameKey, MarkedPoint, Vector
@@ -24,3 +24,18 @@ def marked_by_tracks(control: Control, images: Sequence[ImageTracks], supervised
         return replace(point, pixels=pixels, pixel_sigma=sigma)
 
     return replace(control, points=[marked(point) for point in control.points])
+
+
+def without_tracked(control: Control, names: Collection[str]) -> Control | None:
+    """The control without the points that tracks of these names mark, and what refers to them; None: nothing is left.
+
+    Raises:
+        InputError: what is left does not determine where the scene is.
+    """
+    points = [point for point in control.points if point.pixels is not None or point.name not in names]
+    gone = {point.name for point in control.points} - {point.name for point in points}
+    distances = [distance for distance in control.distances if not gone & {*distance.points}]
+    heights = [height for height in control.heights if not gone & {*height.above}]
+    if not (control.poses or distances or heights or any(point.position is not None for point in points)):
+        return None
+    return replace(control, points=points, distances=distances, heights=heights)

@@ -372,6 +372,12 @@ def test_survey_names_them(result: Reconstruction, tracks: UserTracks, tmp_path:
     found.write(tmp_path / "found")  # and the file of the tracks keeps it
     again = solve_again(tmp_path / "found")
     np.testing.assert_allclose(again.camera_centers(), found.camera_centers(), atol=1e-3)
+    fewer = solve_again(tmp_path / "found", without_tracks=[NAMES[1], NAMES[5]])  # and what is known of them
+    assert fewer.control is not None
+    left = {item.name.removeprefix("point ").partition(" in ")[0] for item in fewer.control.residuals}
+    assert left == {NAMES[0], *NAMES[2:5]}
+    with pytest.raises(InputError, match="positions"):
+        solve_again(tmp_path / "found", without_tracks=NAMES[1:5])
     words = f'control: point {NAMES[0]} has no "pixels", and no track of this name is given'
     with pytest.raises(InputError, match=words):
         solve_again(result, control=tmp_path / "survey.json")
