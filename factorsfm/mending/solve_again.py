@@ -64,8 +64,8 @@ def solve_again(
     known = result if isinstance(result, Reconstruction) else read_with_pictures(result)
     if known.measured is None:
         raise InputError(
-            "the result keeps no tracks to solve again: it is of images in any order, or of an earlier version; "
-            "reconstruct the shot once more"
+            "the result keeps no tracks to solve again: it is of images in any order, has images that were added, or "
+            "is of an earlier version; reconstruct the shot once more"
         )
     first_number = known.options.get("first_number")
     changes = Changes.of(without_tracks, mask_regions, frames, control, first_number)
