@@ -78,7 +78,7 @@ def measure_track_errors(
     known_sigma = np.full(int(o.point[-1]) + 1, np.nan) if known_sigma is None else known_sigma
     known = np.isfinite(known_sigma)
     measured = ~known[o.point]
-    typical = coordinate_sigma(size[measured])
+    typical = coordinate_sigma(size[measured]) if measured.any() else float(np.median(known_sigma))
     next_frame = (np.diff(o.point) == 0) & (np.diff(o.frame) == 1) & measured[1:]
     jumps = np.linalg.norm(np.diff(residual, axis=0)[next_frame], axis=1)
     sigma = max(SMALLEST_SIGMA_PX, min(typical, typical_sigma(jumps) / np.sqrt(2.0))) if len(jumps) else typical

@@ -66,7 +66,7 @@ def align(
     right, made level. What nothing tells stays as it is, and `Reconstruction.alignment` says so.
 
     Args:
-        origin: a pixel, ``Pick`` or "FRAME:X,Y", of the point that becomes the origin.
+        origin: of the point that becomes the origin: a pixel, ``Pick`` or "FRAME:X,Y", or the name of a track.
         axis: of a point in the direction of the x axis.
         plane: of a third point; origin, axis and this one lie on the ground then.
         distance: known between two picked points: the unit becomes the metre.
@@ -76,9 +76,8 @@ def align(
     Raises:
         InputError: a pick or a length cannot be used, or the result is in the world of its control.
     """
-    picks = {
-        name: _pick(pick) for name, pick in (("origin", origin), ("axis", axis), ("plane", plane)) if pick is not None
-    }
+    given = {"origin": origin, "axis": axis, "plane": plane}
+    picks = {name: _pick(reconstruction, pick) for name, pick in given.items() if pick is not None}
     _check(reconstruction, picks, distance, camera_height)
     aligning = _Aligning(reconstruction, picks, footage)
     world = aligning.world()
@@ -96,8 +95,8 @@ def survey(result: Reconstruction) -> Literal["world", "lengths"] | None:
     return "world" if result.control.placed else "lengths"
 
 
-def _pick(pick: Pick | str) -> Pick:
-    return pick if isinstance(pick, Pick) else Pick.parse(pick)
+def _pick(result: Reconstruction, pick: Pick | str) -> Pick:
+    return pick if isinstance(pick, Pick) else Pick.of(result, pick)
 
 
 def _check(
@@ -188,7 +187,9 @@ class _Aligning:
         return up
 
     def _on_ground(self, pick: Pick) -> PickedPoint:
-        """The point behind a pixel; on the ground if it is as near to it as can be told."""
+        """The point of a track, or the one behind a pixel, which is on the ground if it is as near as can be told."""
+        if pick.track is not None:
+            return picked_point(self._result, pick)
         up, ground = self.direction, self.ground
         hit: PickedPoint | None = None
         if ground is not None:
@@ -260,7 +261,7 @@ def _scale(
 ) -> tuple[float, str | None, float | None]:
     """New units in one of the result, where they come from, and the relative standard deviation of all lengths."""
     if distance is not None:
-        length, std = length_between(*(picked_point(result, _pick(pick)) for pick in (distance.a, distance.b)))
+        length, std = length_between(*(picked_point(result, _pick(result, pick)) for pick in (distance.a, distance.b)))
         return distance.metres / length, "distance", float(np.hypot(std / length, distance.sigma / distance.metres))
     if camera_height is not None:
         if height is None or ground is None:

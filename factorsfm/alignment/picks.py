@@ -1,4 +1,4 @@
-"""Points that are picked in a frame: where the scene is behind a pixel, from the tracks around it."""
+"""Points that are picked: where the scene is behind a pixel, from the tracks around it, or the point of a track."""
 
 from __future__ import annotations
 
@@ -32,11 +32,13 @@ class Pick:
     Attributes:
         frame: name, with or without suffix, or index.
         x, y: pixels, centres at integers (OpenCV).
+        track: name of the track that is seen there, whose point is meant; None: what of the scene is behind the pixel.
     """
 
     frame: str | int
     x: float
     y: float
+    track: str | None = None
 
     @classmethod
     def parse(cls, text: str) -> Pick:
@@ -51,11 +53,31 @@ class Pick:
         except ValueError:
             x = y = np.nan
         if not frame or not np.isfinite([x, y]).all():
-            raise InputError(f'"{text}" is no pixel of a frame; FRAME:X,Y is expected, such as 12:640.5,360')
+            raise InputError(
+                f'"{text}" is no pixel of a frame, nor a track with a point; FRAME:X,Y is expected, such as '
+                "12:640.5,360, or a name"
+            )
         return cls(frame, x, y)
 
+    @classmethod
+    def of(cls, result: Reconstruction, text: str) -> Pick:
+        """From the name of a track, where it is seen nearest to the middle of the image, or from FRAME:X,Y.
+
+        Raises:
+            InputError: the text is neither.
+        """
+        names = result.track_names()
+        if text not in names:
+            return cls.parse(text)
+        posed = np.array([frame.registered for frame in result.frames], bool)
+        seen = np.flatnonzero((result.observation_point == names.index(text)) & posed[result.observation_frame])
+        middle = np.array([result.camera.width, result.camera.height]) / 2.0
+        chosen = seen[np.argmin(np.linalg.norm(result.observation_xy[seen] - middle, axis=1))]
+        x, y = result.observation_xy[chosen].tolist()
+        return cls(result.frames[result.observation_frame[chosen]].index, x, y, text)
+
     def __str__(self) -> str:
-        return f"{self.frame}:{self.x:g},{self.y:g}"
+        return f"{self.frame}:{self.x:g},{self.y:g}" if self.track is None else self.track
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +134,7 @@ def ray(result: Reconstruction, pick: Pick) -> tuple[Array, Array]:
 
 
 def picked_point(result: Reconstruction, pick: Pick) -> PickedPoint:
-    """The point of the scene behind a pixel, as if the surface were flat among the nearest tracks.
+    """The point of a track, or of the scene behind a pixel, as if the surface were flat among the nearest tracks.
 
     Inverse depth is linear in the pixels of a plane. What the tracks deviate from that is taken for roughness, which
     the pixel has, too.
@@ -121,6 +143,8 @@ def picked_point(result: Reconstruction, pick: Pick) -> PickedPoint:
         InputError: as `ray`, or there are too few tracks around the pixel.
     """
     center, direction = ray(result, pick)
+    if pick.track is not None:
+        return _tracked_point(result, pick.track, center)
     frame = frame_of(result, pick)
     assert frame.cam_from_world is not None
     camera = result.camera_of(frame)
@@ -135,12 +159,25 @@ def picked_point(result: Reconstruction, pick: Pick) -> PickedPoint:
             f"{pick}: {len(nearest)} tracks are near this pixel, {_FEWEST} are needed; pick where there is texture"
         )
     inverse, std = _at_pixel(away[nearest], 1.0 / depth[nearest], distance[nearest])
-    noise = _relative_noise(result, rows[nearest], center)
+    noise = _relative_noise(result, rows[nearest], center, _noise_px(result.observation_error))
     relative = float(np.hypot(std / inverse, noise))
     z = 1.0 / inverse
     across = np.eye(3) * (z * _CLICK_PX / camera.mean_focal_length()) ** 2
     along = (z * relative) ** 2 * np.outer(direction, direction)
     return PickedPoint(center + z * direction, across + along)
+
+
+def _tracked_point(result: Reconstruction, track: str, center: Array) -> PickedPoint:
+    """The point of a track, as if its typical error were the same in all frames; `center`: of a camera that sees it."""
+    row = result.track_names().index(track)
+    away, noise = result.points[row] - center, _noise_px(result.observation_error[result.observation_point == row])
+    across = np.eye(3) * (noise / result.camera.mean_focal_length()) ** 2 * (away @ away)
+    along = _relative_noise(result, np.array([row]), center, noise) * away
+    return PickedPoint(result.points[row], across + np.outer(along, along))
+
+
+def _noise_px(errors: Array) -> float:
+    return max(float(np.nanmedian(errors)), _LEAST_NOISE_PX)
 
 
 def _at_pixel(away: Array, inverse: Array, distance: Array) -> tuple[float, float]:
@@ -165,12 +202,12 @@ def _at_pixel(away: Array, inverse: Array, distance: Array) -> tuple[float, floa
     return value, _FEW * float(np.sqrt(variance * (1.0 + leverage)))
 
 
-def _relative_noise(result: Reconstruction, rows: NDArray[np.int64], center: Array) -> float:
+def _relative_noise(result: Reconstruction, rows: NDArray[np.int64], center: Array, noise: float) -> float:
     """Relative standard deviation of the distance of some points, as if each track kept one error for good.
 
-    The largest shift in any image when a point moves along its ray tells how well its distance is seen.
+    The largest shift in any image when a point moves along its ray tells how well its distance is seen; `noise` in
+    pixels.
     """
-    noise = max(float(np.nanmedian(result.observation_error)), _LEAST_NOISE_PX)
     wanted = np.flatnonzero(np.isin(result.observation_point, rows))
     shifts: dict[int, float] = dict.fromkeys(rows.tolist(), 0.0)
     for position in np.unique(result.observation_frame[wanted]):

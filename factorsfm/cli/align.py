@@ -13,17 +13,19 @@ from factorsfm.report.thumbnails import retake
 from factorsfm.result.reading import read_result
 from factorsfm.support.errors import InputError
 
-_PICK = "FRAME:X,Y"
+_PICK = "FRAME:X,Y|NAME"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.add_argument("result", type=Path, metavar="RESULT", help="folder that factorsfm reconstruct has written")
     parser.add_argument("--output", type=Path, metavar="DIR", help=f"{RESULT_FOLDER} (default: RESULT itself)")
-    parser.add_argument("--origin", metavar=_PICK, help="pixel of the point that becomes the origin")
-    parser.add_argument("--axis", metavar=_PICK, help="pixel of a point in the direction of the x axis")
     parser.add_argument(
-        "--plane", metavar=_PICK, help="pixel of a third point; origin, axis and this one lie on the ground"
+        "--origin", metavar=_PICK, help="pixel, or name of a track, of the point that becomes the origin"
+    )
+    parser.add_argument("--axis", metavar=_PICK, help="pixel or name of a point in the direction of the x axis")
+    parser.add_argument(
+        "--plane", metavar=_PICK, help="pixel or name of a third point; origin, axis and this one lie on the ground"
     )
     parser.add_argument(
         "--distance",

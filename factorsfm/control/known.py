@@ -86,7 +86,7 @@ class MarkedPoint:
     Attributes:
         name: by which distances and heights refer to it.
         pixels: where frames see it, pixels of the image with centres at integers; one frame at least, two where the
-            position is unknown.
+            position is unknown. None: where the track of the user with this name is.
         pixel_sigma: of each coordinate of a mark, pixels.
         position: (3,) or None; sigma: of each coordinate.
 
@@ -95,22 +95,27 @@ class MarkedPoint:
     """
 
     name: str
-    pixels: Mapping[FrameKey, Vector]
+    pixels: Mapping[FrameKey, Vector] | None = None
     pixel_sigma: float = 1.0
     position: Vector | None = None
     sigma: float | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.pixels, Mapping):
+        if self.pixels is not None and not isinstance(self.pixels, Mapping):
             raise InputError(f'"pixels" is {self.pixels!r}; frames with their [x, y] are expected')
         needed = 1 if self.position is not None else 2
-        if len(self.pixels) < needed:
+        if self.pixels is not None and len(self.pixels) < needed:
             raise InputError(f'"{self.name}" is marked in {len(self.pixels)} of {needed} needed frames')
-        for frame, xy in self.pixels.items():
+        for frame, xy in self.marks.items():
             _check_vector(f"pixels of {frame}", xy, 2)
         _check_vector("position", self.position, 3)
         _check_sigma("pixel_sigma", self.pixel_sigma, True)
         _check_sigma("sigma", self.sigma, self.position is not None)
+
+    @property
+    def marks(self) -> Mapping[FrameKey, Vector]:
+        """The pixels, as far as they are given."""
+        return self.pixels or {}
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,7 +207,9 @@ class Control:
     def _check_enough(self) -> None:
         """As far as that can be said without the images."""
         known = [(pose.position, pose.sigma) for pose in self.poses]
-        known += [(point.position, point.sigma) for point in self.points if len(point.pixels) > 1]
+        known += [
+            (point.position, point.sigma) for point in self.points if point.pixels is None or len(point.pixels) > 1
+        ]
         given = [(position, sigma) for position, sigma in known if position is not None]
         check_enough(
             np.array([position for position, _ in given], np.float64).reshape(-1, 3),
@@ -232,7 +239,7 @@ class Control:
     @property
     def frames(self) -> list[FrameKey]:
         """All frames that are referred to, each once."""
-        marked = [frame for point in self.points for frame in point.pixels]
+        marked = [frame for point in self.points for frame in point.marks]
         ends = [frame for distance in self.distances for frame in distance.frames]
         every = [*marked, *ends, *(height.frame for height in self.heights), *(pose.frame for pose in self.poses)]
         return list(dict.fromkeys(every))

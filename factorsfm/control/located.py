@@ -58,7 +58,7 @@ def find_frames(control: Control, frames: Sequence[tuple[int, str]]) -> dict[Fra
     if missing:
         raise InputError(f"control: there is no frame {missing[0]!r} among the {len(frames)} frames")
     _check_different([pose.frame for pose in control.poses], found)
-    for keys in (*(point.pixels for point in control.points), *(distance.frames for distance in control.distances)):
+    for keys in (*(point.marks for point in control.points), *(distance.frames for distance in control.distances)):
         _check_different(keys, found)
     return {key: found[key] for key in control.frames}
 
@@ -110,10 +110,12 @@ def locate(
     Raises:
         InputError: a frame is not there, or a mark is where the lens has no inverse.
     """
+    if bare := [point.name for point in control.points if point.pixels is None]:
+        raise InputError(f'control: point {bare[0]} has no "pixels", and no track of this name is given (--tracks)')
     found = find_frames(control, [(frame.index, frame.name) for frame in frames])
     marked: dict[int, list[tuple[int, FrameKey, Vector]]] = defaultdict(list)
     for row, point in enumerate(control.points):
-        for key, xy in point.pixels.items():
+        for key, xy in point.marks.items():
             marked[found[key]].append((row, key, xy))
     marks = []
     for position, seen in sorted(marked.items()):

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from factorsfm.control.files import read_control
 from factorsfm.control.known import Control
+from factorsfm.control.tracked_points import without_tracked
 from factorsfm.frames.ranges import checked_range, in_range, parse_range, range_text
 from factorsfm.polish.measured import MeasuredShot
 from factorsfm.support.errors import InputError
@@ -169,14 +170,17 @@ def _without_tracks(measured: MeasuredShot, names: Sequence[int | str]) -> Measu
     """Without some tracks, by their numbers or names.
 
     Raises:
-        InputError: a track is not there.
+        InputError: a track is not there, or without it the control does not determine where the scene is.
     """
     ids = _ids_of(measured, names)
     images = [replace(image, tracks=image.tracks.of(~np.isin(image.tracks.ids, ids))) for image in measured.images]
     points, places = measured.map_points
-    mapped = ~np.isin(points, ids)
+    mapped, control = ~np.isin(points, ids), measured.control
+    if control is not None:
+        control = without_tracked(control, measured.supervised.of(ids).names)
     return replace(
         measured,
+        control=control,
         images=images,
         map_points=(points[mapped], places[mapped]),
         suspects=np.setdiff1d(measured.suspects, ids),

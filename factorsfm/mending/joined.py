@@ -71,6 +71,7 @@ def joined(measured: MeasuredShot, given: UserTracks, lenses: dict[int, pycolmap
         np.r_[known.ids, ids],
         (*known.names, *_new_names([track.name for track in kept], known.names, first)),
         np.r_[known.sigma, [given.sigma / track.weight for track in kept]],
+        known.join,
     )
     notes = (*measured.notes, *given.notes)
     if away := len(given.tracks) - len(kept):

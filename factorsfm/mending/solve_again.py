@@ -15,6 +15,7 @@ from factorsfm.lens.lens import Lens
 from factorsfm.mending.changes import Changes, MaskRegion
 from factorsfm.mending.joined import joined
 from factorsfm.mending.same_world import in_world_of
+from factorsfm.mending.taken_up import taken_up
 from factorsfm.mending.user_tracks import UserTracks, read_tracks
 from factorsfm.polish.measured import MeasuredShot
 from factorsfm.polish.polished import Polished
@@ -63,8 +64,8 @@ def solve_again(
     known = result if isinstance(result, Reconstruction) else read_with_pictures(result)
     if known.measured is None:
         raise InputError(
-            "the result keeps no tracks to solve again: it is of images in any order, or of an earlier version; "
-            "reconstruct the shot once more"
+            "the result keeps no tracks to solve again: it is of images in any order, has images that were added, or "
+            "is of an earlier version; reconstruct the shot once more"
         )
     first_number = known.options.get("first_number")
     changes = Changes.of(without_tracks, mask_regions, frames, control, first_number)
@@ -72,7 +73,7 @@ def solve_again(
     if isinstance(tracks, str | Path):
         tracks = read_tracks(tracks, first_number=first_number)
     if tracks is not None:
-        measured = joined(measured, tracks, {frame.index: known.camera_of(frame) for frame in known.frames})
+        measured = taken_up(joined(measured, tracks, {frame.index: known.camera_of(frame) for frame in known.frames}))
     measured = replace(measured, solved_lens=_solved_lens(known))
     with OneThreadEach():
         polished = _polished(measured, known, progress)

@@ -73,11 +73,12 @@ def _registered_between(
     Args:
         seen: in the registered frames; cameras: with the lens of these.
     """
-    least, state = options.mapper.min_inliers, result.state
+    registering, state = shot.registering(options.mapper), result.state
+    least = registering.min_inliers
     poses = {f: (state.rotation[k], state.translation[k]) for k, f in enumerate(result.frames)}
     between = poses_on_points(
         state, np.searchsorted(registered, result.frames), seen, cameras, shot.turns(registered),
-        moves=result.motion.kind is ShotKind.GENERAL, sigma=result.sigma, options=options.mapper,
+        moves=result.motion.kind is ShotKind.GENERAL, sigma=result.sigma, options=registering,
     )  # fmt: skip
     for found in between:
         position = registered[found.row]

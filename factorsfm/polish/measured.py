@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from factorsfm.control.known import Control
 from factorsfm.control.located import LocatedControl, locate
+from factorsfm.control.tracked_points import marked_by_tracks
 from factorsfm.control.with_factors import ShotFactors
 from factorsfm.frames.recorded import RecordedFootage, RecordedFrame
 from factorsfm.lens.camera_model import distortion_of
@@ -102,7 +103,8 @@ class MeasuredShot:
     def _located_control(self) -> LocatedControl | None:
         if self.control is None:
             return None
-        return locate(self.control, self.frames, lambda position, xy: (self.camera, xy))
+        control = marked_by_tracks(self.control, [image.tracks for image in self.images], self.supervised)
+        return locate(control, self.frames, lambda position, xy: (self.camera, xy))
 
     def _recording(self) -> Recording | None:
         """What a rolling shutter is looked for in."""

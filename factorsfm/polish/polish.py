@@ -34,6 +34,7 @@ from factorsfm.polish.start import Core, PolishStart, polish_start
 from factorsfm.support.errors import ReconstructionError
 from factorsfm.support.options import Options, PolishOptions
 from factorsfm.support.status import ShotKind
+from factorsfm.tracks.supervised import LEAST_SUPERVISED
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -115,10 +116,11 @@ def _start(
         frames = sorted({*frames, *_named(registered, control, factors, o.max_frames // 2)})
         tracks = shot.long_tracks(frames, min(o.min_track_length, max(2, len(frames))))
         observations = shot.observations(frames, tracks)
-        unconnected = _unconnected(observations.of(shot.trusted(tracks)), frames, least)
+        trusted = shot.trusted(tracks)
+        unconnected = _unconnected(shot, observations.of(trusted), tracks[trusted], frames, least)
         if not unconnected:
             start = polish_start(shot, frames, shot.swept(observations, frames, tracks), tracks, options, progress)
-            unconnected = _unconnected(start.observations, frames, least)
+            unconnected = _unconnected(shot, start.observations, start.tracks, frames, least)
         if not unconnected:
             return start, frames, left_out
         logger.info("left out of the polish, too few tracks: images %s", sorted(unconnected))
@@ -135,10 +137,17 @@ def _named(registered: list[int], control: LocatedControl | None, factors: ShotF
     return sorted({*names} & {*registered})
 
 
-def _unconnected(observations: Observations, frames: list[int], least: int) -> dict[int, str]:
-    """The images (of these, in the order of the observations) that too few observations join to the others, and why."""
-    joined, seen = connected_frames(observations, len(frames), least)
-    return {frames[row]: too_few_tracks(int(seen[row]), least) for row in np.nonzero(~joined)[0].tolist()}
+def _unconnected(
+    shot: Shot, observations: Observations, tracks: Index, frames: list[int], least: int
+) -> dict[int, str]:
+    """The images (of these, in the order of the observations) that too few of the tracks join to the others, and why.
+
+    A few supervised tracks are enough.
+    """
+    supervised, count = np.isin(tracks, shot.supervised.ids), -(-least // LEAST_SUPERVISED)
+    joined, seen = connected_frames(observations, len(frames), least, np.where(supervised, count, 1))
+    counted = f"; a supervised one counts for {count}" if supervised.any() else ""
+    return {frames[row]: too_few_tracks(int(seen[row]), least) + counted for row in np.nonzero(~joined)[0].tolist()}
 
 
 # --- the solution -----------------------------------------------------------------------------------------------

@@ -14,8 +14,9 @@ from factorsfm.camera.projection import without_distortion
 from factorsfm.lens.lens import Lens
 from factorsfm.lens.rolling_shutter import Recording, with_sweep
 from factorsfm.mapping.mapped_images import MappedImage
+from factorsfm.support.options import MapperOptions
 from factorsfm.tracks.image_tracks import ImageTracks, seen_by
-from factorsfm.tracks.supervised import SupervisedTracks
+from factorsfm.tracks.supervised import LEAST_SUPERVISED, SupervisedTracks
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -112,8 +113,13 @@ class Shot:
         return np.union1d(seen_by(tracks, least), np.intersect1d(seen_by(tracks, 2), self.supervised.ids))
 
     def trusted(self, tracks: Index) -> Index:
-        """Rows of the tracks on which the cameras are solved first: neither suspected nor supervised."""
-        return np.flatnonzero(~np.isin(tracks, np.r_[self.suspects, self.supervised.ids]))
+        """Rows of the tracks on which the cameras are solved first: not suspected, nor supervised if these can wait."""
+        waiting = self.suspects if self.supervised.join else np.r_[self.suspects, self.supervised.ids]
+        return np.flatnonzero(~np.isin(tracks, waiting))
+
+    def registering(self, options: MapperOptions) -> MapperOptions:
+        """How images are registered on solved points: by a few where supervised tracks alone join some of them."""
+        return replace(options, min_inliers=LEAST_SUPERVISED) if self.supervised.join else options
 
     def observations(self, frames: Sequence[int], tracks: Index) -> Observations:
         """Of some tracks (ascending ids) in some images."""

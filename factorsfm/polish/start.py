@@ -133,7 +133,7 @@ def _in_all_frames(
     def all_frames(state: State, *, moves: bool) -> State:
         return in_all_frames(
             state, rows, seen, shot.group[frames], shot.turns(frames),
-            moves=moves, sigma=adjustment.sigma, options=options.mapper,
+            moves=moves, sigma=adjustment.sigma, options=shot.registering(options.mapper),
         )  # fmt: skip
 
     state = all_frames(adjustment.state, moves=True)
@@ -289,16 +289,20 @@ def _with_fitting_tracks(
     left_out = np.union1d(left_out, np.flatnonzero(~agree))
     supervised = np.isin(tracks, shot.supervised.ids)
     judged, moves = np.flatnonzero(~supervised), np.zeros(len(tracks), bool)
-    moves[judged] = moving_together(
-        observations.of(judged), errors[~supervised[observations.point]], solved.sigma,
-        rests_on=np.searchsorted(judged, points), left_out=np.searchsorted(judged, left_out),
-    )  # fmt: skip
+    rests_on = np.flatnonzero(np.isin(judged, points))
+    if len(rests_on):
+        moves[judged] = moving_together(
+            observations.of(judged), errors[~supervised[observations.point]], solved.sigma,
+            rests_on=rests_on, left_out=np.flatnonzero(np.isin(judged, left_out)),
+        )  # fmt: skip
     scene, moving = agree & ~moves, tracks[moves]
     if not scene.all():
         kept = np.flatnonzero(scene)
         state, tracks, errors = state.of(kept), tracks[kept], errors[scene[observations.point]]
         supervised = supervised[kept]
         observations = observations.of(kept)
+    if supervised.all():
+        return state, observations, tracks, moving
     if options.observation_sigmas is None:
         kept = np.flatnonzero(_usual_points(observations, errors, ~supervised, options) | supervised)
         return state.of(kept), observations.of(kept), tracks[kept], moving

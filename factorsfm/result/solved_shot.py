@@ -11,7 +11,7 @@ from factorsfm.polish.polished import Polished
 from factorsfm.result.assembly import assemble
 from factorsfm.result.lost_frames import lost_frames
 from factorsfm.result.reconstruction import Reconstruction
-from factorsfm.result.supervised import supervised_notes
+from factorsfm.result.supervised import supervised_doubts, supervised_notes
 
 
 def solved_shot(measured: MeasuredShot, polished: Polished, seconds: Mapping[str, float]) -> Reconstruction:
@@ -37,5 +37,6 @@ def solved_shot(measured: MeasuredShot, polished: Polished, seconds: Mapping[str
             f"Tracks that a network takes for what moves: {len(measured.suspects)}; {agree} of them agree with the "
             "scene and take part."
         )
+    result.doubts += supervised_doubts(result)
     result.notes += [*supervised_notes(result), *measured.notes]
     return result

@@ -8,8 +8,10 @@ import numpy as np
 
 from factorsfm.control.fit import CONTRADICTION
 from factorsfm.result.reconstruction import Reconstruction
+from factorsfm.tracks.image_tracks import seen_by
 
 _MOST_NAMED = 12  # tracks in a sentence
+_MOST_OFF = 1 / 3  # of the supervised tracks, with which a solve that rests on them may still be right
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +66,21 @@ def supervised_notes(result: Reconstruction) -> list[str]:
     if lost := [point.name for point in points if point.position is None]:
         notes.append(f"Supervised tracks without a point, since the solved frames do not place it: {_some(lost)}.")
     return notes
+
+
+def supervised_doubts(result: Reconstruction) -> list[str]:
+    """Why a result that rests on its supervised tracks is doubtful, in sentences."""
+    if result.measured is None or not result.measured.supervised.join:
+        return []
+    points, often = named_points(result), seen_by([i.tracks for i in result.measured.images if i.registered], 2)
+    off = [point.name for point in points if point.contradicts]
+    behind = [point.name for point in points if point.position is None and point.track - 1 in often]
+    doubts = []
+    if len(off) > _MOST_OFF * len(points):
+        doubts.append(f"Of the {len(points)} supervised tracks that join frames, {len(off)} contradict the others.")
+    if behind:
+        doubts.append(f"Supervised tracks that join frames have no point in front of the cameras: {_some(behind)}.")
+    return doubts
 
 
 def _some(names: list[str]) -> str:

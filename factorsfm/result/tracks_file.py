@@ -85,6 +85,7 @@ class _Facts:
     options: dict[str, Any]
     control: dict[str, Any] | None
     notes: list[str]
+    supervised_join: bool = False
 
 
 def write_tracks(measured: MeasuredShot, path: Path) -> None:
@@ -110,6 +111,7 @@ def write_tracks(measured: MeasuredShot, path: Path) -> None:
         options=measured.options.to_dict(),
         control=None if measured.control is None else asdict(measured.control),
         notes=list(measured.notes),
+        supervised_join=known.join,
     )
     arrays = {
         "frame_start": np.cumsum([0, *(len(image.ids) for image in tracks)]),
@@ -208,6 +210,7 @@ def _measured(facts: _Facts, arrays: Arrays) -> MeasuredShot:
             np.array([one.track for one in known], np.int64),
             tuple(one.name for one in known),
             np.array([one.sigma for one in known]),
+            facts.supervised_join,
         ),
         options=Options.from_dict(facts.options),
         control=None if facts.control is None else control_of(facts.control),

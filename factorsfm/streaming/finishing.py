@@ -17,6 +17,7 @@ from factorsfm.graph.factors_on_poses import FactorsOnPoses
 from factorsfm.mapping.mapped_images import MappedImage
 from factorsfm.mapping.mapper import Mapper
 from factorsfm.mending.joined import joined
+from factorsfm.mending.taken_up import taken_up
 from factorsfm.mending.user_tracks import UserTracks
 from factorsfm.polish.measured import MeasuredShot
 from factorsfm.polish.polished import Polished
@@ -105,7 +106,7 @@ class EndedShot:
             control=self.control,
             notes=tuple(notes),
         )
-        return measured if self.tracks is None else joined(measured, self.tracks)
+        return measured if self.tracks is None else taken_up(joined(measured, self.tracks))
 
     def _factors(self) -> ShotFactors | None:
         """Those that were added to the live graph, with the poses that these are beside."""

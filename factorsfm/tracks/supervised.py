@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
+LEAST_SUPERVISED = 5  # of which a frame that nothing else joins to the others sees at least: a pose needs three
+
 
 @dataclass(frozen=True, slots=True)
 class SupervisedTracks:
@@ -19,11 +21,13 @@ class SupervisedTracks:
         ids: (n,) ascending.
         names: (n,) of the user.
         sigma: (n,) standard deviation of each coordinate of their places, pixels.
+        join: whether only they join some images to the others, so that the cameras rest on them from the first.
     """
 
     ids: Index
     names: tuple[str, ...]
     sigma: Array
+    join: bool = False
 
     @classmethod
     def none(cls) -> SupervisedTracks:
@@ -40,7 +44,8 @@ class SupervisedTracks:
     def of(self, ids: Index) -> SupervisedTracks:
         """Those among some tracks."""
         kept = np.flatnonzero(np.isin(self.ids, ids))
-        return SupervisedTracks(self.ids[kept], tuple(self.names[k] for k in kept.tolist()), self.sigma[kept])
+        names = tuple(self.names[k] for k in kept.tolist())
+        return SupervisedTracks(self.ids[kept], names, self.sigma[kept], self.join)
 
     def names_of(self, tracks: Index) -> list[str]:
         """(m,) names of some tracks: those of the user, else `track_name`."""

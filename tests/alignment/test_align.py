@@ -65,6 +65,24 @@ def test_a_scene_stands_on_its_floor_below_the_first_camera() -> None:
             )
 
 
+def test_the_points_of_tracks_are_picked_by_their_names() -> None:
+    result = room()
+    floor = np.asarray(result.frames[0].cam_from_world * result.points)[:600]
+    seen = np.flatnonzero(np.bincount(result.observation_point, minlength=600)[:600] >= 2)
+    wanted = np.array([[0.3, FLOOR, 4.5], [1.2, FLOOR, 4.6], [0.2, FLOOR, 6.0]])
+    rows = [seen[np.argmin(np.linalg.norm(floor[seen] - place, axis=1))] for place in wanted]
+    a, b, c = (result.track_names()[row] for row in rows)
+    aligned = align(result, origin=a, axis=b, plane=c, distance=Length(a, b, 2.0))
+    known = aligned.alignment
+    assert (known.up_from, known.origin_from, known.x_from) == (["picks"], "pick", "pick")
+    np.testing.assert_allclose(aligned.points[rows[:2]], [[0, 0, 0], [2, 0, 0]], atol=1e-9)
+    np.testing.assert_allclose(aligned.points[:600, 1], 0, atol=1e-9)
+    assert 0 < known.origin_std < 0.1
+    assert 0 < known.scale_std < 0.02
+    with pytest.raises(InputError, match=r'"track_99999" is no pixel of a frame, nor a track with a point; FRAME:X,Y'):
+        align(result, origin="track_99999")
+
+
 def test_an_earlier_alignment_is_no_evidence() -> None:
     """Wrong picks can be taken back, and to align twice changes nothing."""
     result = room()
@@ -235,8 +253,8 @@ def test_the_command_writes_a_result_that_says_how_it_is_aligned(
         ({"origin": "0:900,1"}, "outside of the frame, which has 480x270"),
         ({"camera_height": -1.0}, "the camera height is -1"),
         ({"distance": Length("0:240,200", "0:240,200", 1.0)}, "pick points further apart"),
-        ({"origin": ""}, '"" is no pixel of a frame; FRAME:X,Y is expected'),
-        ({"origin": "0:240,200", "axis": ""}, '"" is no pixel of a frame; FRAME:X,Y is expected'),
+        ({"origin": ""}, '"" is no pixel of a frame, nor a track with a point; FRAME:X,Y is expected'),
+        ({"origin": "0:240,200", "axis": ""}, '"" is no pixel of a frame, nor a track with a point'),
         ({"camera_height": 1e300}, r"the camera height is 1e\+300; a number of metres from 1e-09 to 1e\+09 is"),
         ({"distance": Length("0:100,200", "0:400,200", 1e300)}, r"the distance is 1e\+300; a number of metres from"),
         ({"distance": Length("0:100,200", "0:400,200", 1e-300)}, "the distance is 1e-300; a number of metres from"),

@@ -301,7 +301,7 @@ def test_the_command(result: Reconstruction, folder: Path, tmp_path: Path, capsy
     assert_error(capsys.readouterr(), "choose another one")
     (tmp_path / "mended" / "tracks.npz").unlink()
     assert main(["solve", str(tmp_path / "mended"), "--output", str(tmp_path / "further")]) == 2
-    assert_error(capsys.readouterr(), "keeps no tracks to solve again")
+    assert_error(capsys.readouterr(), "keeps no tracks to solve again", "has images that were added, or")
     assert not (tmp_path / "further").exists()
 
 

@@ -336,6 +336,53 @@ def test_named_points_are_nulls(solved: Path, tmp_path: Path) -> None:
     assert not prim.GetChildren()
 
 
+def test_a_scene_is_aligned_at_them(solved: Path, tmp_path: Path) -> None:
+    picks = ["--origin", NAMES[1], "--axis", NAMES[4], "--distance", NAMES[1], NAMES[4], "2"]
+    assert main(["align", str(solved), *picks, "--output", str(tmp_path / "aligned")]) == 0
+    places = {
+        p["name"]: p["position"] for p in json.loads((tmp_path / "aligned/summary.json").read_text())["named_points"]
+    }
+    np.testing.assert_allclose(places[NAMES[1]], 0, atol=1e-6)
+    assert np.linalg.norm(places[NAMES[4]]) == pytest.approx(2.0, abs=1e-6)
+    assert places[NAMES[4]][2] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_survey_names_them(result: Reconstruction, tracks: UserTracks, tmp_path: Path) -> None:
+    rows = np.linspace(0, len(result.points) - 1, 8).astype(int)
+    surveyed = dict(zip(NAMES[:5], (2.0 * result.points[rows] + [1.0, -2.0, 3.0])[:5].tolist(), strict=True))
+    points = [{"name": name, "position": place, "sigma": 0.005} for name, place in surveyed.items()]
+    distance = {"points": NAMES[4:6], "length": 1.0, "sigma": 100.0}
+    write_table(tracks, tmp_path / "tracks.csv")
+    (tmp_path / "survey.json").write_text(
+        json.dumps({"points": [*points, {"name": NAMES[5]}], "distances": [distance]})
+    )
+    options = {"control": tmp_path / "survey.json", "tracks": tmp_path / "tracks.csv"}
+    found = solve_again(result, **options)
+    assert found.metric
+    places = dict(zip(found.track_names(), found.points, strict=True))
+    for name, place in surveyed.items():
+        assert 0 < np.linalg.norm(places[name] - place) < 0.3  # seen by the images alone
+    assert found.control is not None
+    errors = {item.name: item.error for item in found.control.residuals}
+    assert max(errors[f"point {name}"] for name in surveyed) < 0.01
+    assert f"point {NAMES[5]}" not in errors
+    assert sum(name.startswith(f"point {NAMES[5]} in ") for name in errors) == FRAMES
+    paths = [np.linalg.norm(np.ptp(r.camera_centers(), axis=0)) for r in (result, found)]
+    assert paths[1] == pytest.approx(2.0 * paths[0], rel=0.1)
+    found.write(tmp_path / "found")  # and the file of the tracks keeps it
+    again = solve_again(tmp_path / "found")
+    np.testing.assert_allclose(again.camera_centers(), found.camera_centers(), atol=1e-3)
+    fewer = solve_again(tmp_path / "found", without_tracks=[NAMES[1], NAMES[5]])  # and what is known of them
+    assert fewer.control is not None
+    left = {item.name.removeprefix("point ").partition(" in ")[0] for item in fewer.control.residuals}
+    assert left == {NAMES[0], *NAMES[2:5]}
+    with pytest.raises(InputError, match="positions"):
+        solve_again(tmp_path / "found", without_tracks=NAMES[1:5])
+    words = f'control: point {NAMES[0]} has no "pixels", and no track of this name is given'
+    with pytest.raises(InputError, match=words):
+        solve_again(result, control=tmp_path / "survey.json")
+
+
 def test_they_are_left_out_by_their_names_and_numbers(solved: Path, tmp_path: Path) -> None:
     number = next(
         p["track"] for p in json.loads((solved / "summary.json").read_text())["named_points"] if p["name"] == "slips"

@@ -194,10 +194,14 @@ def test_the_larger_part_of_what_falls_apart_is_kept():
     point = np.concatenate(seen)
     order = np.lexsort((frame, point))
     observations = Observations(frame[order], point[order], np.zeros((len(point), 2)))
-    joined, shared = connected_frames(observations, 8, 15)
+    once, worth = np.ones(86, int), np.where(np.arange(86) < 80, 1, 3)
+    joined, shared = connected_frames(observations, 8, 15, once)
     np.testing.assert_array_equal(joined, [False] * 4 + [True] * 4)
     np.testing.assert_array_equal(shared, [6, 6, 6, 0, 46, 46, 46, 46])
-    np.testing.assert_array_equal(connected_frames(observations, 8, 6)[0], [True] * 3 + [False] + [True] * 4)
+    np.testing.assert_array_equal(connected_frames(observations, 8, 6, once)[0], [True] * 3 + [False] + [True] * 4)
+    joined, shared = connected_frames(observations, 8, 15, worth)
+    np.testing.assert_array_equal(joined, [True] * 3 + [False] + [True] * 4)
+    np.testing.assert_array_equal(shared, [58, 58, 58, 0, 58, 58, 58, 58])
 
 
 @pytest.mark.parametrize("motion", ["rotation", "static"])
