@@ -23,9 +23,10 @@ class TrackerOptions:
     """Tracking in video (`tracks.flow`).
 
     Attributes:
-        max_tracks: most tracks alive at a time.
+        max_tracks: most tracks alive at a time. More of them lie on weaker texture and take the time of a live stream.
         replenish_below: share of `max_tracks` that must be free before new tracks start.
-        window_px: side of the Lucas-Kanade window.
+        window_px: side of the Lucas-Kanade window. A smaller one is better on clean renders and worse on noisy clips; a
+            larger one lies across the edges of things more often.
         levels: pyramid levels in the flow from frame to frame, above the image that it is sought in: the full one, or
             where its longer side has more than 1280 pixels that one halved until it has no more.
         border_px: smallest distance of a track to the image border.
