@@ -22,7 +22,7 @@ _MOVED_PX = 0.1
 # pixel a frame less than 0.6 changes then with H.264, up to 0.9 with MPEG-4, MPEG-2 and VP9 at their lowest rates;
 # where frames do repeat, and move by as little, 0.6 or more.
 _CHANGED, _SOME_PERCENTILE = 0.6, 66.0  # of the new frames: repeats that were missed are among them
-_BLOCK_PX = 16  # as most codecs leave them
+_BLOCK_PX, _EVERY = 16, 4  # as most codecs leave them; where one changes, one in four of its rows does
 _FINE = 16  # steps of a grey level in the texture of a block, which ends at 16 levels: dark images count as well
 _AROUND, _LEAST_AROUND = 8, 2  # new frames that a difference is compared with
 _MOST_IN_A_ROW = 3  # animation on fours; a camera that stands for longer is no cadence
@@ -45,8 +45,10 @@ class RepeatDetector:
         before, self._before = self._before, rows
         if before is None:
             return False
-        change, texture = cv2.absdiff(rows, before), cv2.absdiff(rows[:, 1:], rows[:, :-1])
+        change = cv2.absdiff(rows, before)
         difference = cv2.mean(change)[0]
+        few = rows[::_EVERY]
+        texture = cv2.absdiff(few[:, 1:], few[:, :-1])
         if self._is_repeat(difference, cv2.mean(texture)[0]):
             self._in_a_row += 1
             if self._in_a_row <= _MOST_IN_A_ROW:
@@ -54,7 +56,7 @@ class RepeatDetector:
             self._differences.clear()  # the camera stands: new frames differ as little from here on
         self._in_a_row = 0
         self._differences.append(difference)
-        self._changed.append(_share_changed(change, texture, max(1, _BLOCK_PX // step)))
+        self._changed.append(_share_changed(change[::_EVERY], texture, max(1, _BLOCK_PX // (step * _EVERY))))
         return False
 
     def _is_repeat(self, difference: float, texture: float) -> bool:

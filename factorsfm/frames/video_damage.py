@@ -25,7 +25,7 @@ _ANNOUNCED_SHARE = 0.95  # of what the container announces, which is not exact
 # many as in the keyframe and more. In sound renders and films they do in 1 to 4 %, at most twice as many.
 _EDGE, _NOISY_SHARE, _NOISY_TIMES = 40, 0.08, 3.0
 _LEAST_SHARE = 0.001  # of the keyframe: one without edges says nothing
-_COMPARED_PIXELS = 500_000  # of whole rows
+_COMPARED_PIXELS = 100_000  # of whole rows
 
 
 class Numbers:
