@@ -178,7 +178,7 @@ def _solved_core(shot: Shot, frames: list[int], observations: Observations, trac
         adjustment, lens, zoom = _estimate_lens(adjustment, shot, frames, options, search, zoom_beside, moves=moves)
         if shutter is not None and (shutter := shutter.known_with(lens)) is None:
             adjustment, lens, zoom = _estimate_lens(at_once, shot, frames, options, search, zoom_beside, moves=moves)
-    elif shot.in_time and is_doubtful(adjustment, options):
+    elif shot.in_time:
         zoom = zoom_beside(adjustment)
     if motion is None or lens is not None or shutter is not None:
         motion = _motion(adjustment, found.rest, o)

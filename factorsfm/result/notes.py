@@ -73,6 +73,11 @@ def result_doubts(polished: Polished, moving_share: float) -> list[str]:
             f"{100 * moving_share:.0f} % of the image moves by itself: the cameras rest on the smaller part, whose "
             "tracks the larger one drags along where it passes."
         )
+    if polished.zoom and polished.contradiction is not None:
+        doubts.append(
+            f"A zoom of {polished.zoom:.2f} explains the tracks as well as this path, whose points the depth prior "
+            "contradicts."
+        )
     if polished.lens is not None and polished.lens.misfit_px:
         doubts.append(f"The tracks fit no lens: their typical error is {polished.lens.misfit_px:.2f} pixels.")
     return doubts
@@ -101,8 +106,8 @@ def result_notes(
         notes.append(lens_note(polished.lens))
     if polished.zoom:
         notes.append(
-            f"The tracks ask for a zoom: one that changes the focal length by {polished.zoom:.2f} explains them far "
-            "better than one focal length; try --lens zoom."
+            f"The tracks ask for a zoom: one that changes the focal length by {polished.zoom:.2f} explains them better "
+            "than one focal length, or as well as a way towards a flat wall; try --lens zoom."
         )
     if polished.control is not None:
         notes += control_notes(polished.control)

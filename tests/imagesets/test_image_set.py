@@ -3,6 +3,7 @@
 import json
 import logging
 import struct
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -591,6 +592,23 @@ def test_sets_and_shots_are_told_apart(shot: RenderedShot, tmp_path: Path) -> No
     assert not looks_unordered(tmp_path / "film.mp4")
     (tmp_path / "single" / "b.txt").write_text("x")
     assert other_files(tmp_path / "single") == ["b.txt"]
+
+
+def test_the_grain_of_a_shot_does_not_make_photographs_of_it(shot: RenderedShot, tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+
+    def grainy(name: str, images: Sequence[np.ndarray]) -> Path:
+        (tmp_path / name).mkdir()
+        for k, image in enumerate(images):
+            noisy = image + rng.normal(0.0, 25.0, image.shape)
+            cv2.imwrite(str(tmp_path / name / f"{k:04d}.png"), np.clip(noisy, 0, 255).astype(np.uint8))
+        return tmp_path / name
+
+    moved = [np.roll(shot.images[0], (2 * k, 3 * k), (0, 1)) for k in range(4)]
+    assert not looks_unordered(grainy("shot", moved))
+    assert looks_unordered(grainy("turned", [cv2.rotate(i, k % 3) for k, i in enumerate(moved)]))
+    steps = render_shot("arc", 4, 480, 270, parallax=0.3)
+    assert looks_unordered(grainy("steps", steps.images))
 
 
 @pytest.mark.parametrize(

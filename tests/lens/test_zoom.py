@@ -10,7 +10,7 @@ from factorsfm.lens.lens import through
 from factorsfm.polish.polish import polish
 from factorsfm.polish.shot import Shot
 from factorsfm.report.result_folder import write_folder
-from factorsfm.result.notes import _motion_notes, lens_note
+from factorsfm.result.notes import _motion_notes, lens_note, result_doubts
 from factorsfm.result.reading import read_result
 from factorsfm.result.summary import focal_range, summary
 from factorsfm.support.options import DETERMINED_FOCAL_STD
@@ -107,6 +107,16 @@ def test_a_given_lens_is_kept_where_the_tracks_ask_for_a_zoom():
     problem, result = polished("handheld", 1.4, parallax=0.1, guess=1.0, lens="fixed")
     np.testing.assert_array_equal(result.state.focal, problem.focal)
     assert result.zoom == pytest.approx(1.4, rel=0.01)
+
+
+def test_a_zoom_through_a_given_lens_is_suspected_where_the_path_leads_to_a_wall():
+    """Its tracks fit as well as any: only the depth prior may tell."""
+    _, result = polished("static", 1.4, parallax=0.0, guess=1.0, lens="fixed")
+    assert result.motion.kind is ShotKind.GENERAL
+    assert result.zoom == pytest.approx(1.4, rel=1e-3)
+    assert not result_doubts(result, 0.0)
+    (doubt,) = result_doubts(replace(result, contradiction=0.06), 0.0)
+    assert doubt.startswith("A zoom of 1.40 explains the tracks as well")
 
 
 def test_frames_between_the_solved_ones_have_the_focal_length_between():
