@@ -32,8 +32,8 @@ _SAMPLED_CORNERS = 200
 _TRACKED_SHARE = 0.5  # of the corners, in the median pair, below which the images are no shot
 _CHECK_PX = 1.0  # largest forward-backward error of a tracked corner
 _PATCH_PX, _PATCH_CORRELATION = 15, 0.9  # side of the patch around a corner, and its least correlation in both images
-# Grain and darkness leave little that correlates. Without it, as many corners of a shot can be tracked as otherwise,
-# and all move alike; of photographs two steps apart, too, but by different ways: less than a third of them alike.
+# Grain leaves little that correlates. Behind a blur that takes it away, most corners of a shot can be tracked and move
+# alike, 0.56 to 0.97 of them. So can many of photographs from two places, but by different ways: 0.27 at most alike.
 _GRAIN_PX, _ALIKE_PX = 2.5, 5.0  # standard deviation of the blur; most that a corner may move beside the typical one
 
 
