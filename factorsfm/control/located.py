@@ -108,7 +108,7 @@ def locate(
         in_camera: gives the camera of the frame at a position, and what pixels (n, 2) of the frame are in it.
 
     Raises:
-        InputError: a frame is not there, or a mark is where the lens has no inverse.
+        InputError: a frame is not there, a mark is where the lens has no inverse, or a point has none.
     """
     if bare := [point.name for point in control.points if point.pixels is None]:
         raise InputError(f'control: point {bare[0]} has no "pixels", and no track of this name is given (--tracks)')

@@ -185,10 +185,10 @@ def _tracked_share(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> float
     if not len(tracked):
         return 1.0
     found, moved = _tracked_corners(*(cv2.GaussianBlur(image, (0, 0), _GRAIN_PX) for image in (a, b)))
-    alike = found
-    if found.any():
-        alike = found & (np.linalg.norm(moved - np.median(moved[found], axis=0), axis=1) < _ALIKE_PX)
-    return float(max(tracked.mean(), alike.mean() if len(alike) else 0.0))
+    if not found.any():
+        return float(tracked.mean())
+    alike = np.linalg.norm(moved - np.median(moved[found], axis=0), axis=1) < _ALIKE_PX
+    return float(max(tracked.mean(), (found & alike).mean()))
 
 
 def _tracked_corners(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:

@@ -133,12 +133,12 @@ def _motion(velocity: Array, time: Array, place: Array) -> tuple[Array, Array]:
         velocity: (4, n, 2) between five images, of which this one is in the middle, NaN where one of two is missing;
         time: (4,) between these images.
     """
-    _, to, on, _ = velocity
+    before, to, on, beyond = velocity
     acceleration = _smooth(2.0 * (on - to) / (time[1] + time[2]), place)
     motion = (to * time[2] + on * time[1]) / (time[1] + time[2])
     for end, away in (
-        (velocity[3], -time[2] - 0.5 * time[3]),
-        (velocity[0], time[1] + 0.5 * time[0]),
+        (beyond, -time[2] - 0.5 * time[3]),
+        (before, time[1] + 0.5 * time[0]),
         (on, -0.5 * time[2]),
         (to, 0.5 * time[1]),
     ):
